@@ -65,7 +65,7 @@ def variants(problem: Problem) -> dict[str, Callable[[], Any]]:
     def picture(made: Scene, *, picture: bool = True, labels: bool = False) -> Callable[[], Any]:
         names = requested_labels(()) if labels else frozenset[str]()
         drawing = Rasterizer(made, problem.texture, drawing_config(made, picture=picture, labels=names))
-        return lambda: drawing.look(position, None, place_instruments(made, position, 0.2))
+        return lambda: drawing.render(position, None, place_instruments(made, position, 0.2))
 
     def pinhole(lens: dict[str, Any]) -> Scene:
         focal, middle = 1.2 * problem.pixels, (problem.pixels - 1) / 2

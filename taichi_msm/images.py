@@ -129,7 +129,7 @@ def _open(path: str, sha256: str | None = None) -> Iterator[Image.Image]:
     from PIL import Image, UnidentifiedImageError
 
     _require_file(path)
-    # libtiff and Pillow also print their errors, which repeats the exception.
+    # libtiff and Pillow also print their errors, in addition to the exception.
     with discarded_output(2), warnings.catch_warnings():
         warnings.simplefilter("ignore")
         warnings.simplefilter("error", Image.DecompressionBombWarning)
@@ -137,7 +137,7 @@ def _open(path: str, sha256: str | None = None) -> Iterator[Image.Image]:
             with ExitStack() as opened:
                 file = opened.enter_context(actual_path(path).open("rb"))
                 if sha256 is not None and _sha256(file) != sha256:
-                    raise PictureError(f"{path} is not the file of the run, by its SHA-256; put that one back")
+                    raise PictureError(f"{path} is not the file of the run, by its SHA-256; restore that file")
                 file.seek(0)
                 image = opened.enter_context(Image.open(file, formats=PICTURE_FORMATS))
                 if max(image.size) > MAX_SIDE_PX:
@@ -202,7 +202,7 @@ def irregular_kind(path: Path) -> str:
 
 
 def actual_path(path: str) -> Path:
-    """Return the path of a file's copy (see `use_copies`), or its own path."""
+    """Return the path of a file's copy (see `use_copies`), or the path of the file."""
     return _copies.get(path) or Path(path)
 
 

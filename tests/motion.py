@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from taichi_msm.accuracy.mesh import MeshEstimate
-from taichi_msm.accuracy.report import RunErrorEstimates, run_warnings
+from taichi_msm.accuracy.run_errors import RunErrorEstimates, run_warnings
 from taichi_msm.accuracy.time_step import TimeStepEstimate, TimeStepTrials, max_norm
 from taichi_msm.model.plan import Plan
 from taichi_msm.model.tool_force import probe_records

@@ -16,11 +16,9 @@ from taichi_msm.solver.planning import affords_companions, stable_steps
 # An error below this share of the largest displacement needs no fine companion run.
 NEGLIGIBLE_ERROR = 1e-3
 
-# Largest number of steps of a coarse companion run, relative to the run; with more steps it saves too little.
-MAX_COARSE_RATIO = 0.6
-
-# Largest refinement of the step in a fine companion run. If the damping needs a larger one, the error is unknown.
-MAX_REFINEMENT = 64
+# Largest number of steps of a fine companion run, as a multiple of the run's. If the damping needs more, the error is
+# unknown.
+MAX_STEP_RATIO = 64
 
 # Cost of the companion runs on coarser meshes, in steps of the full sheet per step of the run that they are compared
 # with. Without contact there are two, with half and a quarter of the cells per side and of the steps; with contact one,
@@ -38,8 +36,8 @@ class CompanionRuns(NamedTuple):
     # Steps per frame of the companion run that follows if the first one shows a large error; 0 without one.
     subsequent_steps: int = 0
     mesh: bool = False  # whether there are companion runs on coarser meshes
-    cost: float = 0.0  # of the parallel companion runs, in steps of the full sheet per step of the run
-    reason: str = ""  # why the time-step error is not estimated; empty if it is
+    cost: float = 0.0  # cost of the parallel companion runs, in steps of the full sheet per step of the run
+    reason: str = ""  # reason for a missing estimate of the time-step error; empty if there is one
 
     @property
     def planned(self) -> bool:
@@ -51,8 +49,11 @@ def choose_companion_runs(plan: Plan, *, requested: bool = False) -> CompanionRu
     """Choose the companion runs of a run.
 
     Args:
-        plan: Plan of the run.
-        requested: Whether the user requested an error estimate, whatever it costs.
+        plan: plan of the run.
+        requested: whether the user requested an error estimate at any cost.
+
+    Returns:
+        Companion runs and their cost, or the reason for a missing estimate.
     """
     if plan.scene.time.at_rest:
         mesh = plan.scene.tissue is not None and (requested or affords_companions(plan, MESH_COST))
@@ -81,7 +82,8 @@ def coarse_steps(plan: Plan) -> int:
     """Return the steps per frame of the coarse companion run, half of the run's; 0 if unstable or too expensive."""
     run_steps = plan.grid.steps_per_frame
     steps = max(math.ceil(run_steps / 2), stable_steps(plan))
-    return steps if steps <= MAX_COARSE_RATIO * run_steps else 0
+    # With more than 0.6 of the run's steps it saves too little.
+    return steps if steps <= 0.6 * run_steps else 0
 
 
 def fine_steps(plan: Plan) -> int:
@@ -90,7 +92,7 @@ def fine_steps(plan: Plan) -> int:
     If g h / r > 1, with g = C / m, central differences reverse velocities at every step, and the difference between
     runs with steps h and h / r underestimates the error. A coarse companion run overestimates it 2 to 4 times.
 
-    It is 0 if the damping needs more than `MAX_REFINEMENT` times the run's steps.
+    The number is 0 if the damping needs more than `MAX_STEP_RATIO` times the run's steps.
     """
     refinement = max(2, math.ceil(plan.material.drag * plan.grid.step))
-    return refinement * plan.grid.steps_per_frame if refinement <= MAX_REFINEMENT else 0
+    return refinement * plan.grid.steps_per_frame if refinement <= MAX_STEP_RATIO else 0

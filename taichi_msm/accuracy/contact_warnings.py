@@ -14,19 +14,22 @@ from taichi_msm.model.sheet import rest_positions, spacing
 from taichi_msm.model.tools import Tool, touching_tools
 from taichi_msm.solver.state import RunProgress
 
-# At a larger depth of a tip, in radii of the tip, the mass points of a soft sheet slide off sideways.
-MAX_INDENTATION_RATIO = 1 / 5
-
-# Smallest depth of the tissue in a tool that its axis pierces, in radii.
-MIN_PIERCING_RATIO = 0.1
-
 
 def tool_contact_warnings(plan: Plan, progress: RunProgress) -> Iterator[str]:
-    """Warn about tools that slide through a soft sheet, and about the first tool that pierced the sheet."""
+    """Warn about tools that slide through a soft sheet, and about the first tool that pierced the sheet.
+
+    Args:
+        plan: plan of the run.
+        progress: progress of the run, with the first piercing tool.
+
+    Yields:
+        Warnings with the tool, the numbers that make its force invalid, and a remedy.
+    """
     membrane, foundation = _stiffnesses(plan)
     remedy = "take friction: rough, " if plan.scene.time.at_rest else ""
     for tool in (tool for tool in touching_tools(plan.tools) if not tool.rough):
-        depth, limit = _max_depth(tool, plan.scene.time.duration), MAX_INDENTATION_RATIO * tool.radius
+        # Deeper than a fifth of the radius, the mass points of a soft sheet slide off sideways.
+        depth, limit = _max_depth(tool, plan.scene.time.duration), tool.radius / 5
         if membrane < (support := foundation * tool.radius**2) and depth > limit * (1 + 1e-9):
             yield (
                 f"probes.{tool.probe}: the sheet slides off the tip sideways, and its force is too small: the sheet "
@@ -39,7 +42,7 @@ def tool_contact_warnings(plan: Plan, progress: RunProgress) -> Iterator[str]:
             time, cell = progress.pierced_frame / plan.grid.frames_per_second, max(spacing(plan.scene.sheet))
             yield (
                 f"probes.{tool.probe}: the instrument went through the sheet, first at {time:.6g} s, frame "
-                f"{progress.pierced_frame}: its middle line passes between points, which are {cell:.3g} m apart at "
+                f"{progress.pierced_frame}: its axis passes between points, which are {cell:.3g} m apart at "
                 f"rest; its radius is {tool.radius:.3g} m. Its force is invalid from there on; take a wider "
                 "instrument or more points, press less, or move it from above and within the border"
             )
@@ -49,9 +52,9 @@ def first_piercing_probe(plan: Plan, displacement: NDArray[np.floating], frame: 
     """Return the first position-controlled tool whose axis passes through the sheet.
 
     Args:
-        plan: Plan of the run.
-        displacement: Displacements of the mass points [m], shape (rows, cols, 3).
-        frame: Number of their frame.
+        plan: plan of the run.
+        displacement: displacements of the mass points [m], shape (rows, cols, 3).
+        frame: number of their frame.
 
     Returns:
         The index of its probe plus 1, or 0 if no tool pierces the sheet.
@@ -81,9 +84,9 @@ def _pierces(tool: Tool, position: NDArray[np.floating], time: float) -> bool:
         weights = np.roll(x, -1, 1) * np.roll(y, -2, 1) - np.roll(x, -2, 1) * np.roll(y, -1, 1)
         inside = ((weights >= 0).all(axis=1) | (weights <= 0).all(axis=1)) & (weights.sum(axis=1) != 0)
         height = (weights * triangle[..., 0]).sum(axis=1)[inside] / weights.sum(axis=1)[inside]
-        # The tip of a plate lies on the tissue that it presses.
+        # The tip of a plate lies on the tissue that it presses, so a tenth of the radius is tolerated.
         depth, *_ = tool.shape.build_depth(NUMPY)(*np.outer(tool.axis, height), *tool.axis, tool.length, tool.radius)
-        if ((height >= 0) & (height <= tool.length) & (depth > MIN_PIERCING_RATIO * tool.radius)).any():
+        if ((height >= 0) & (height <= tool.length) & (depth > 0.1 * tool.radius)).any():
             return True
     return False
 

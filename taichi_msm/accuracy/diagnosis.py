@@ -19,18 +19,14 @@ from taichi_msm.solver.dynamics import ForceRecorder
 from taichi_msm.solver.sheet_solver import SheetSolver
 from taichi_msm.solver.state import RunProgress, Snapshot, largest_displacement
 
-# Budget of all trial runs together, in steps times mass points, about ten seconds. It is counted rather than timed, so
-# that the message is the same on every machine.
-MAX_NODE_STEPS = 5e9
-
 
 @dataclass(frozen=True)
 class Diagnosis:
     """Diagnosis of a divergence.
 
     Attributes:
-        message: Time, step, mass point, likely cause and remedy.
-        last_sound_state: Last state of the run without a fault; None if it is the start.
+        message: time, step, mass point, likely cause and remedy.
+        last_sound_state: last state of the run without a fault; None if it is the start.
     """
 
     message: str
@@ -41,9 +37,12 @@ def diagnose(dynamics: SheetSolver, start: Snapshot | None, pause: Pause) -> Dia
     """Find the step, the mass point and the likely cause of a divergence within the current frame.
 
     Args:
-        dynamics: Sheet that diverged; its state afterwards is arbitrary.
-        start: Sound state to repeat the run from; None for the state of rest.
-        pause: Called several times a second; an exception from it ends the diagnosis.
+        dynamics: sheet that diverged; its state afterwards is arbitrary.
+        start: sound state to repeat the run from; None for the state of rest.
+        pause: called several times a second; an exception from it ends the diagnosis.
+
+    Returns:
+        The message, and the last sound state.
     """
     plan, grid, bad_step = dynamics.plan, dynamics.plan.grid, dynamics.steps_done
     recorder = ForceRecorder(plan)
@@ -85,7 +84,10 @@ def diagnose(dynamics: SheetSolver, start: Snapshot | None, pause: Pause) -> Dia
 def _likely_cause(dynamics: SheetSolver, bad_step: int, point: tuple[int, int], pause: Pause) -> str:
     """Describe the likely cause: the time step if a finer one does not diverge, else a force or a path."""
     plan, grid = dynamics.plan, dynamics.plan.grid
-    frames, finest_step, budget = -(-bad_step // grid.steps_per_frame), math.inf, MAX_NODE_STEPS
+    frames, finest_step = -(-bad_step // grid.steps_per_frame), math.inf
+    # Steps times mass points of all trial runs together, about ten seconds. They are counted rather than timed, so that
+    # the message is the same on every machine.
+    budget = 5e9
     for refinement in (2, 4, 8, 16, 32, 64):
         finer = plan.with_grid(steps_per_frame=refinement * grid.steps_per_frame)
         budget -= frames * finer.grid.steps_per_frame * math.prod(plan.scene.sheet.points)

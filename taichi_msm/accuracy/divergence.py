@@ -16,9 +16,6 @@ from taichi_msm.terms import TERMS
 from taichi_msm.terms.foundation import FoundationTerm, foundation_energy, point_shares
 from taichi_msm.terms.loads import force_norm, max_free_acceleration
 
-# Largest displacement of a mass point by deformation, in sizes of the sheet. A free sheet may also fly away.
-MAX_SHEET_SIZES = 10.0
-
 # Factor by which the energy may exceed the energy supplied by the loads. The energy of Verlet's method oscillates by
 # 1 / (1 - (h / h_stable)^2) about the true energy, and somewhat more where springs are compressed to a point.
 ENERGY_OSCILLATION = 4.0
@@ -27,18 +24,21 @@ ENERGY_OSCILLATION = 4.0
 def displacement_bound(
     plan: Plan, time: float, acceleration: float | None = None, tool_energy: float | None = None
 ) -> float:
-    """Bound the displacement of a mass point [m], possibly by infinity; a run that exceeds the bound has diverged.
+    """Return a bound of the displacement of a mass point [m], infinite for some scenes.
+
+    A run that exceeds the bound has diverged.
 
     Args:
-        plan: Plan of the run.
-        time: Time since the start of the run [s].
-        acceleration: Bound of the acceleration of a free mass point by the probes so far [m/s^2]; by default that of
+        plan: plan of the run.
+        time: time since the start of the run [s].
+        acceleration: bound of the acceleration of a free mass point by the probes so far [m/s^2]; by default that of
             the scene's probes.
-        tool_energy: Bound of the energy supplied by position-controlled tools so far [J]; by default that of the
+        tool_energy: bound of the energy supplied by position-controlled tools so far [J]; by default that of the
             scene's tools.
     """
-    # A tool moves the tissue that it holds along its path.
-    bound = MAX_SHEET_SIZES * max(plan.scene.sheet.size) + sum(tool.path_length + tool.radius for tool in plan.tools)
+    # Deformation moves a mass point by at most ten sizes of the sheet; a tool moves the tissue that it holds along its
+    # path.
+    bound = 10.0 * max(plan.scene.sheet.size) + sum(tool.path_length + tool.radius for tool in plan.tools)
     # Here springs connect every mass point to a held one; shear springs alone may skip every other mass point.
     if plan.is_held and min(plan.material.across, plan.material.down) > 0:
         return bound
@@ -70,8 +70,12 @@ class DivergenceMonitor:
     After the last load, energy that grows is a sign of steps that are too long for compressed springs, see
     `energy_growth_warnings`.
 
+    Args:
+        plan: plan of the run.
+        progress: progress at the frame from which the run continues; None for the start.
+
     Attributes:
-        progress: Progress at the last frame without a fault, initially at the first frame.
+        progress: progress at the last frame without a fault, initially at the first frame.
     """
 
     def __init__(self, plan: Plan, progress: RunProgress | None = None) -> None:
@@ -181,13 +185,13 @@ class DivergenceMonitor:
 
 
 def format_message(time: float, step: int, fault: str, *, exact: bool) -> str:
-    """Format the message about a divergence.
+    """Return the message about a divergence.
 
     Args:
-        time: Time of the divergence [s].
-        step: Number of the step.
-        fault: Fault reported by `DivergenceMonitor`.
-        exact: Whether the previous step is known to have no fault.
+        time: time of the divergence [s].
+        step: number of the step.
+        fault: fault reported by `DivergenceMonitor`.
+        exact: whether the previous step is known to have no fault.
     """
     return f"diverged {'at' if exact else 'before'} {time:.6g} s, step {step}: {fault}"
 
@@ -227,6 +231,13 @@ def energy_growth_warnings(plan: Plan, progress: RunProgress) -> Iterator[str]:
     The energy is measured with the position x_n and the velocity half a step before. For a mode of frequency w it
     differs from the energy that Verlet's method conserves by a factor between 1 - w h / 2 and 1 + w h / 2, where
     w h / 2 is at most r = h / h_stable. Hence an energy more than (1 + r) / (1 - r) times an earlier one has grown.
+
+    Args:
+        plan: plan of the run.
+        progress: progress of the run, with the growth of the energy.
+
+    Yields:
+        A warning with the growth, the time and remedies.
 
     Source: Hairer, Lubich and Wanner 2003, Acta Numerica 12, 399-450, on the conserved energy.
     """

@@ -53,9 +53,6 @@ from taichi_msm.solver.planning import choose_precision, plan_variant, stable_st
 from taichi_msm.solver.rest import build_dynamics
 from taichi_msm.system.runtime import Device
 
-# Orders between which the three runs count as convergent.
-MIN_ORDER, MAX_ORDER = 1.0, 3.0
-
 # Order with position-controlled tools.
 CONTACT_ORDER = 1.5
 
@@ -75,15 +72,8 @@ MAX_DIFFERENCE = 1.0
 # - smallest radius of a tool for which the comparison is meaningful, in cells of the run.
 MIN_RADIUS_CELLS = 0.8
 
-# Tissue counts as compressed if a spring is shorter than without force by more than this share of its length.
-COMPRESSION_TOLERANCE = 1e-4
-
-# Largest number of trial runs in a search; largest and smallest refinement of the cells from one to the next.
-MAX_TRIALS = 10
-MAX_CELL_REFINEMENT, MIN_CELL_REFINEMENT = 2.0, 1.1
-
-# The search aims at this share of the tolerance, so that its mesh is nearly the coarsest.
-TOLERANCE_TARGET = 0.8
+# Largest refinement of the cells from one trial run of a search to the next.
+MAX_CELL_REFINEMENT = 2.0
 
 # Smallest number of mass points per side for which a sheet with half the cells is comparable.
 MIN_POINTS_PER_SIDE = 7
@@ -101,7 +91,7 @@ class MeshEstimate:
     """Estimated discretisation error of the mesh."""
 
     error: float  # largest error, as a fraction of the largest displacement; infinite if unknown
-    doubt: str = ""  # why the error may be larger, or is unknown; empty if the estimate is reliable
+    doubt: str = ""  # reason for a larger or unknown error; empty if the estimate is reliable
     at_most: bool = False  # whether the error may be much smaller, because of contact
 
 
@@ -109,8 +99,8 @@ def coarser_plan(plan: Plan, ratio: float = 0.5) -> Plan | None:
     """Plan the scene on a coarser mesh with the same total forces.
 
     Args:
-        plan: Plan of the scene.
-        ratio: Cells per side, as a share of the plan's.
+        plan: plan of the scene.
+        ratio: cells per side, as a share of the plan's.
 
     Returns:
         The plan; None without tissue, with too few mass points, or if the cells would be too long.
@@ -154,7 +144,7 @@ def _with_equal_force(probe: Probe, sheet: Sheet, coarse: Sheet) -> Probe:
     return probe.model_copy(update={"total": tuple(force / coarse_force * part for part in probe.total)})
 
 
-def sampling_force_error(scene: Scene) -> float:
+def _sampling_force_error(scene: Scene) -> float:
     """Return the largest relative difference between a tool's force on the mesh and on a much finer mesh."""
     # The force of a tool is summed over at most 4 million mass points.
     refinement = min(8, math.isqrt(4_000_000 // math.prod(scene.sheet.points)))
@@ -174,13 +164,13 @@ class MeshCompanion:
     They are the run of `mesh_companion_plan` and, without position-controlled tools, one with half of its cells.
 
     Args:
-        plan: Plan of the run that they are compared with.
-        coarse: Plan of the first companion run, from `mesh_companion_plan`.
-        device: Device to run on.
-        cores: Number of CPU cores for stepping; None for all.
+        plan: plan of the run that they are compared with.
+        coarse: plan of the first companion run, from `mesh_companion_plan`.
+        device: device to run on.
+        cores: number of CPU cores for stepping; None for all.
 
     Raises:
-        DeviceError: When the device cannot run them in f64.
+        DeviceError: when the device cannot run them in f64.
     """
 
     def __init__(self, plan: Plan, coarse: Plan, device: Device, cores: int | None = None) -> None:
@@ -197,7 +187,7 @@ class MeshCompanion:
         points = zip(plan.scene.sheet.points, coarse.scene.sheet.points, strict=True)
         self._ratio = min((count - 1) / (fewer - 1) for count, fewer in points)
         self._differences = [0.0 for _ in plans]
-        self._sampling_error = sampling_force_error(plan.scene)
+        self._sampling_error = _sampling_force_error(plan.scene)
         self._contact = plan.has_contact
         cell = max(spacing(plan.scene.sheet))
         self._narrow = any(tool.radius < MIN_RADIUS_CELLS * cell for tool in touching_tools(plan.tools))
@@ -212,8 +202,8 @@ class MeshCompanion:
         """Step to the next frame and compare it.
 
         Args:
-            displacement: Displacements of the run at that frame [m], shape (rows, cols, 3).
-            pause: Called several times a second; after an exception from it the companion runs cannot continue.
+            displacement: displacements of the run at that frame [m], shape (rows, cols, 3).
+            pause: called several times a second; after an exception from it the companion runs cannot continue.
         """
         self._largest = max(self._largest, max_norm(displacement))
         finer = displacement
@@ -235,7 +225,16 @@ class MeshCompanion:
         return self._sheets[0].tool_forces()
 
     def build_second_run(self, plan: Plan, device: Device, cores: int | None = None) -> MeshCompanion | None:
-        """Build the second companion run, which begins at the first frame; return None if the first one suffices."""
+        """Build the second companion run, which begins at the first frame.
+
+        Args:
+            plan: plan of the run.
+            device: device to run on.
+            cores: number of CPU cores for stepping; None for all.
+
+        Returns:
+            The second companion run; None if the first one suffices.
+        """
         if self._contact and not self._narrow and self._relative_difference > SECOND_RUN_DIFFERENCE:
             coarse = coarser_plan(plan, SECOND_CELL_RATIO)
             self._second_run = None if coarse is None else MeshCompanion(plan, coarse, device, cores)
@@ -264,7 +263,7 @@ class MeshCompanion:
             # An order above 2 counts as 2 minus a quarter of the excess (docs/decisions/0022).
             assumed = max(1.0, min(order, 2 - (order - 2) / 4))
         relative = first / (self._ratio**assumed - 1) / self._largest
-        if order is not None and not MIN_ORDER <= order <= MAX_ORDER:
+        if order is not None and not 1 <= order <= 3:
             doubt = "runs with fewer points do not converge"
         elif self._may_wrinkle:
             doubt = WRINKLING
@@ -272,7 +271,8 @@ class MeshCompanion:
 
     @property
     def _may_wrinkle(self) -> bool:
-        compressed = self._shortest_spring < 1 - self._material.tension - COMPRESSION_TOLERANCE
+        # A spring is shorter than without force by more than 1e-4 of its length.
+        compressed = self._shortest_spring < 1 - self._material.tension - 1e-4
         return self._material.bending == 0 and compressed
 
     def _contact_estimate(self, difference: float) -> MeshEstimate:
@@ -288,7 +288,12 @@ class MeshCompanion:
 
 
 def with_points(scene: Scene, points: tuple[int, int]) -> Scene:
-    """Return a copy of a scene with other numbers of mass points (rows, columns) and without `sheet.tolerance`."""
+    """Return a copy of a scene with another mesh and without `sheet.tolerance`.
+
+    Args:
+        scene: scene to copy.
+        points: numbers of rows and columns of mass points.
+    """
     return scene.model_copy(update={"sheet": scene.sheet.model_copy(update={"points": points, "tolerance": None})})
 
 
@@ -303,22 +308,22 @@ def choose_points(
     The search begins with the plan's mesh, and keeps the shape of the cells.
 
     Args:
-        plan: Plan of a scene with a tolerance of the sheet.
-        device: Device for the trial runs.
-        check: Function that validates and plans a scene with given maps.
-        progress: Called with the number of finished frames of each trial run and their total.
+        plan: plan of a scene with a tolerance of the sheet.
+        device: device for the trial runs.
+        check: function that validates and plans a scene with given maps.
+        progress: called with the number of finished frames of each trial run and their total.
 
     Returns:
         The plan with that mesh, and its estimated error.
 
     Raises:
-        SceneError: When even the finest possible mesh is too coarse, or cannot be run.
+        SceneError: when even the finest possible mesh is too coarse, or cannot be run.
     """
     tolerance, given = plan.scene.sheet.tolerance, plan.scene.sheet.points
     assert tolerance is not None
     refinement = max(1.0, (MIN_POINTS_PER_SIDE - 1) / (min(given) - 1))
     max_refinement = (MAX_POINTS - 1) / (max(given) - 1)
-    for _ in range(MAX_TRIALS):
+    for _ in range(10):
         rows, cols = (round((count - 1) * refinement) + 1 for count in given)
         try:
             trial = choose_precision(check(with_points(plan.scene, (rows, cols)), plan.maps), device.arch)
@@ -328,13 +333,14 @@ def choose_points(
         estimate = estimate_mesh_error(trial, device, progress)
         if estimate.error <= tolerance:
             return trial, estimate
-        # The error decreases at most with the square of the cell length.
-        needed = refinement * math.sqrt(estimate.error / (TOLERANCE_TARGET * tolerance))
+        # The error decreases at most with the square of the cell length. The search aims at 0.8 of the tolerance, which
+        # makes its mesh nearly the coarsest.
+        needed = refinement * math.sqrt(estimate.error / (0.8 * tolerance))
         if estimate.doubt in (NARROW_TIP, NOT_CONVERGED) and needed == math.inf:
             needed = MAX_CELL_REFINEMENT * refinement  # On a finer mesh the error is known.
         if needed > max_refinement:
             break
-        refinement *= min(MAX_CELL_REFINEMENT, max(MIN_CELL_REFINEMENT, needed / refinement))
+        refinement *= min(MAX_CELL_REFINEMENT, max(1.1, needed / refinement))
     raise SceneError(
         [
             f"sheet.tolerance: {tolerance:g} is out of reach: with {rows} x {cols} points the error is "
@@ -346,7 +352,16 @@ def choose_points(
 
 
 def estimate_mesh_error(plan: Plan, device: Device, progress: ProgressCallback) -> MeshEstimate:
-    """Run a scene, for which `mesh_companion_plan` exists, and its companion runs in f64; estimate the mesh error."""
+    """Estimate the mesh error of a scene by a run and its companion runs, all in f64.
+
+    Args:
+        plan: plan of the scene, for which `mesh_companion_plan` exists.
+        device: device to run on.
+        progress: called with the number of finished frames and their total.
+
+    Returns:
+        The estimate after the last frame.
+    """
     exact, coarse, grid = plan.with_grid(precision="f64"), mesh_companion_plan(plan), plan.grid
     assert coarse is not None
     first = MeshCompanion(exact, coarse, device)
@@ -366,8 +381,11 @@ def interpolate(displacement: NDArray[Any], target: NDArray[Any]) -> NDArray[np.
     """Interpolate by cubics at the nodes of another lattice.
 
     Args:
-        displacement: Displacements at the nodes of a lattice of at least 4 x 4 [m], shape (rows, cols, 3).
-        target: Field of the other lattice, shape (rows, cols, 3); its values are not used.
+        displacement: displacements at the nodes of a lattice of at least 4 x 4 [m], shape (rows, cols, 3).
+        target: field of the other lattice, shape (rows, cols, 3); its values are not used.
+
+    Returns:
+        Displacements at the nodes of the other lattice [m], of the shape of `target`.
     """
     for count, target_count in zip(displacement.shape[:2], target.shape[:2], strict=True):
         first, weights = _cubic_weights(count - 1, target_count - 1)

@@ -27,15 +27,9 @@ from taichi_msm.solver.rest import build_dynamics
 from taichi_msm.system.runtime import Device
 from taichi_msm.terms import build_terms
 
-# Shapes that differ by more than this share of the largest displacement are different equilibria.
-DIFFERENCE_TOLERANCE = 0.01
-
 # Smallest ratio of the movement in a jump to that between the frames before and after it, for the same change of the
 # loads. A sheet without tension, which moves as the cube root of its load, reaches 4.5 where the load changes its sign.
 JUMP_FACTOR = 6.0
-
-# Number of second solutions, and the cost of each, from rest, in frames of the run.
-SECOND_SOLUTIONS, SECOND_SOLUTION_FRAMES = 3, 3
 
 Array = NDArray[Any]
 
@@ -60,7 +54,12 @@ class PathDependence:
         self._differences: list[tuple[float, int, str]] = []
 
     def check_frame(self, frame: int, displacement: Array) -> None:
-        """Compare the displacements of the next frame [m], shape (rows, cols, 3), with those of earlier frames."""
+        """Compare the next frame with earlier ones.
+
+        Args:
+            frame: number of the frame.
+            displacement: displacements of the mass points [m], shape (rows, cols, 3).
+        """
         size, current = max_norm(displacement), (frame, displacement)
         if size > self._largest:
             self._largest, self._most_displaced, self._unloaded = size, current, None
@@ -91,11 +90,18 @@ class PathDependence:
 
     def affords(self, companion_cost: float) -> bool:
         """Return whether second solutions, in addition to companion runs of a cost, are a small part of the run."""
-        second_cost = SECOND_SOLUTIONS * SECOND_SOLUTION_FRAMES / (self._plan.grid.frames + 1)
+        # Three second solutions, each from rest, which costs about three frames of the run.
+        second_cost = 3 * 3 / (self._plan.grid.frames + 1)
         return affords_companions(self._plan, companion_cost + second_cost)
 
     def finish(self, device: Device, cores: int | None, pause: Pause) -> None:
-        """Solve the most displaced frame, one after it and the last frame a second time, see `second_solution`."""
+        """Solve the most displaced frame, one after it and the last frame a second time, see `second_solution`.
+
+        Args:
+            device: device to solve on.
+            cores: number of CPU cores; None for all.
+            pause: called often; an exception from it ends the solutions.
+        """
         has_history = any(term.has_history(self._plan) for term in build_terms(self._plan))
         if self._largest == 0 or has_history:
             return
@@ -108,7 +114,8 @@ class PathDependence:
     def warnings(self) -> Iterator[str]:
         """Warn of the frame that differs most from the result of another loading path."""
         distance, frame, description = max(self._differences, default=(0.0, 0, ""))
-        if distance > DIFFERENCE_TOLERANCE * self._largest:
+        # Shapes that differ by more than 1 % of the largest displacement are different equilibria.
+        if distance > 0.01 * self._largest:
             remedy = "tissue.pretension, bending or a stiffer foundation"
             if self._plan.scene.tissue is None:
                 remedy = "larger springs.virtual"
@@ -124,14 +131,14 @@ def second_solution(plan: Plan, frame: int, device: Device, cores: int | None, p
     """Solve a frame from rest: its loads act at once, then tools move straight from their first positions.
 
     Args:
-        plan: Plan of a quasi-static scene.
-        frame: Number of the frame.
-        device: Device to solve on.
-        cores: Number of CPU cores; None for all.
-        pause: Called often; an exception from it ends the solution.
+        plan: plan of a quasi-static scene.
+        frame: number of the frame.
+        device: device to solve on.
+        cores: number of CPU cores; None for all.
+        pause: called often; an exception from it ends the solution.
 
     Returns:
-        Displacements [m], shape (rows, cols, 3). None if a tool holds tissue at this frame, which depends on its path,
+        Displacements [m], shape (rows, cols, 3); None if a tool holds tissue at this frame, which depends on its path,
         or if there is no equilibrium.
     """
     scene, rate = plan.scene, plan.grid.frames_per_second

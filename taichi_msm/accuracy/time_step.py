@@ -46,8 +46,7 @@ COARSE_MARGIN = 1.25
 # of this error that a coarse companion run can cause (docs/decisions/0027).
 CONTACT_MARGIN, COARSE_INFLUENCE = 1.5, 1 / 3
 
-# Largest number of trial runs in a search, and largest refinement of the step from one to the next.
-MAX_STEP_TRIALS = 12
+# Largest refinement of the step from one trial run of a search to the next.
 MAX_STEP_REFINEMENT = 8.0
 
 
@@ -55,7 +54,7 @@ MAX_STEP_REFINEMENT = 8.0
 class TimeStepEstimate:
     """Estimated error of the time step and of rounding, as fractions of the largest displacement."""
 
-    steps_per_frame: int  # of the run
+    steps_per_frame: int  # steps per frame of the run
     # Largest error; infinite if it is unknown: a companion run diverged, or the step does not resolve the damping.
     error: float
     rounding: float  # part of the error that comes from f32, including positions in the trajectory; 0 in f64
@@ -75,20 +74,20 @@ def choose_step(
     """Search for the largest stable step whose estimated error is within the scene's tolerance.
 
     Args:
-        plan: Plan with a tolerance; its number of steps per frame is the smallest that is tried.
-        device: Device for the trial runs.
-        progress: Called with the number of finished frames of each trial run and their total.
+        plan: plan with a tolerance; its number of steps per frame is the smallest that is tried.
+        device: device for the trial runs.
+        progress: called with the number of finished frames of each trial run and their total.
 
     Returns:
         The plan with that step, and its estimated error.
 
     Raises:
-        SceneError: When no step meets the tolerance; suggests a precision or a tolerance.
+        SceneError: when no step meets the tolerance; suggests a precision or a tolerance.
     """
     tolerance, steps, trials = plan.scene.time.tolerance, plan.grid.steps_per_frame, TimeStepTrials(plan, device)
     assert tolerance is not None
     insufficient, best, failures = steps - 1, None, []
-    for _ in range(MAX_STEP_TRIALS):
+    for _ in range(12):
         trial = trials.estimate(steps, progress)
         if trial.error <= tolerance:
             best = trial
@@ -116,16 +115,16 @@ class TimeStepCompanion:
     up to it.
 
     Args:
-        plan: Plan of the run.
-        steps: Steps per frame of the companion run; 0 if the error cannot be estimated.
-        device: Device to run on.
-        cores: Number of CPU cores for stepping; None for all. With the run's number of cores its kernels are reused.
+        plan: plan of the run.
+        steps: steps per frame of the companion run; 0 if the error cannot be estimated.
+        device: device to run on.
+        cores: number of CPU cores for stepping; None for all. With the run's number of cores its kernels are reused.
 
     Attributes:
-        displacement: Displacements of the companion run at the last frame [m], shape (rows, cols, 3).
+        displacement: displacements of the companion run at the last frame [m], shape (rows, cols, 3).
 
     Raises:
-        DeviceError: When the device cannot run it in f64.
+        DeviceError: when the device cannot run it in f64.
     """
 
     def __init__(self, plan: Plan, steps: int, device: Device, cores: int | None = None) -> None:
@@ -144,7 +143,12 @@ class TimeStepCompanion:
         self.restart(plan, steps)
 
     def restart(self, plan: Plan, steps: int) -> None:
-        """Restart for another run of the same scene; a fine companion run must stay fine."""
+        """Restart for another run of the same scene; a fine companion run must stay fine.
+
+        Args:
+            plan: plan of the run.
+            steps: steps per frame of the companion run; 0 if the error cannot be estimated.
+        """
         self._plan, self._steps = plan, steps
         exact = plan.with_grid(precision="f64")
         if steps:
@@ -161,8 +165,8 @@ class TimeStepCompanion:
         """Step to the next frame and compare it.
 
         Args:
-            displacement: Displacements of the run at that frame [m], shape (rows, cols, 3).
-            pause: Called several times a second; after an exception from it the companion run cannot continue.
+            displacement: displacements of the run at that frame [m], shape (rows, cols, 3).
+            pause: called several times a second; after an exception from it the companion run cannot continue.
         """
         if not self._steps:
             return
@@ -183,7 +187,7 @@ class TimeStepCompanion:
                 self._rounding = max(self._rounding, max_norm(displacement - same_step))
 
     def force_error(self, forces: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Estimate the error of the mean forces since the previous frame [N], shape (tools, 3), at order 1."""
+        """Return the error of the mean forces since the previous frame [N], shape (tools, 3), at order 1."""
         ratio = self._steps / self._plan.grid.steps_per_frame
         return np.asarray(self._margin * abs(ratio / (ratio - 1)) * np.abs(forces - self._dynamics.tool_forces()))
 
@@ -208,7 +212,15 @@ class TimeStepCompanion:
 
 
 def combine_estimates(coarse: TimeStepEstimate, fine: TimeStepEstimate) -> TimeStepEstimate:
-    """Combine the estimates of both companion runs: the fine one, with contact adjusted by the coarse one."""
+    """Combine the estimates of both companion runs.
+
+    Args:
+        coarse: estimate of the coarse companion run.
+        fine: estimate of the fine companion run.
+
+    Returns:
+        The fine estimate, with contact adjusted by the coarse one.
+    """
     if not fine.at_most or fine.error in (0, math.inf):
         return fine
     share = min(max(coarse.error / fine.error, 1 - COARSE_INFLUENCE), 1 + COARSE_INFLUENCE)
@@ -218,7 +230,12 @@ def combine_estimates(coarse: TimeStepEstimate, fine: TimeStepEstimate) -> TimeS
 
 
 class TimeStepTrials:
-    """Trial runs of a scene with different steps, each with a companion run."""
+    """Trial runs of a scene with different steps, each with a companion run.
+
+    Args:
+        plan: plan of the scene.
+        device: device for the trial runs.
+    """
 
     def __init__(self, plan: Plan, device: Device) -> None:
         self._plan = plan
@@ -226,7 +243,15 @@ class TimeStepTrials:
         self._dynamics = Dynamics(plan, device)
 
     def estimate(self, steps: int, progress: ProgressCallback = lambda done, total: None) -> TimeStepEstimate:
-        """Run the scene with a number of steps per frame and estimate its error."""
+        """Run the scene and estimate its error.
+
+        Args:
+            steps: steps per frame.
+            progress: called with the number of finished frames and their total.
+
+        Returns:
+            The estimated error with these steps.
+        """
         plan = self._plan.with_grid(steps_per_frame=steps)
         fine, frames = fine_steps(plan), plan.grid.frames
         self._companion.restart(plan, fine)

@@ -78,7 +78,16 @@ class Derivatives:
 
 
 def scene_derivatives(plan: Plan, gradient: SheetGradient, loads: LoadGradient) -> Derivatives:
-    """Apply the chain rule to derivatives with respect to the coefficients of a sheet and to its loads."""
+    """Apply the chain rule to the derivatives with respect to the coefficients and the loads of a sheet.
+
+    Args:
+        plan: plan of the differentiated run, with a stiffness map.
+        gradient: derivatives with respect to the coefficients of the sheet.
+        loads: derivatives with respect to the loads, already by the keys of the scene.
+
+    Returns:
+        Derivatives with respect to the numbers and maps of the scene.
+    """
     material, kind = plan.material, plan.scene.kind
     assert material.factors is not None
     by_coefficient = _coefficient_gradient(plan, gradient)
@@ -134,7 +143,7 @@ def _from_logarithm(derivative: float, value: float) -> float:
 
 
 def _gradient_by_factors(plan: Plan, gradient: SheetGradient) -> Array:
-    """Return the derivatives with respect to the factors of the cells: the transpose of `springs.stiffness`."""
+    """Return the derivatives with respect to the factors of the cells, the transpose of `spring_stiffness`."""
     material = plan.material
     along_rows, along_columns = gradient.springs[0].copy(), gradient.springs[1].copy()
     if not material.by_area:
@@ -181,7 +190,11 @@ def _with_value(section: Any, path: tuple[str, ...], value: complex) -> Any:
 
 
 class LoadGradient:
-    """Derivatives with respect to the loads, accumulated over blocks of steps; `by_key` is as in `Derivatives`."""
+    """Derivatives with respect to the loads, accumulated over blocks of steps.
+
+    Attributes:
+        by_key: derivatives by key, as `Derivatives.numbers`.
+    """
 
     def __init__(self, plan: Plan) -> None:
         self._plan = plan
@@ -197,10 +210,13 @@ class LoadGradient:
             self.by_key[f"probes.{index}.at"] = np.zeros((*np.shape(probe.at)[:-1], 2))
 
     def add(self, schedule_of: Callable[[Plan], Schedule], by_slot: Array, times: tuple[float, float]) -> None:
-        """Add the derivatives of a block of steps, whose loads are in an interval of times [s].
+        """Add the derivatives of a block of steps.
 
-        `schedule_of` returns the schedule of these steps for a plan with other loads. `by_slot` are the derivatives
-        with respect to the force and the control point of every slot, shape (steps, slots, 5).
+        Args:
+            schedule_of: function that returns the schedule of these steps for a plan with other loads.
+            by_slot: derivatives with respect to the force (3) and the control point (2) of every slot, shape (steps,
+                slots, 5).
+            times: interval that contains the loads of the block [s]; other keyframes are skipped.
         """
         height, width = self._plan.scene.sheet.size
         for index, slots in self._slots.items():

@@ -29,7 +29,11 @@ Array = NDArray[np.float64]
 
 
 def require_differentiable(plan: Plan) -> None:
-    """Raise a SceneError if a scene has position-controlled tools, or another term without a gradient."""
+    """Require a scene that has a gradient.
+
+    Raises:
+        SceneError: when it has position-controlled tools, or another term without a gradient.
+    """
     for tool in plan.tools:
         reason = "a tool with a path has no gradient, as points meet and leave it; fit such scenes by differences"
         raise SceneError([f"probes.{tool.probe}.path: {reason}"])
@@ -63,6 +67,11 @@ def _require_memory(plan: Plan) -> None:
 
 class Adjoint:
     """Differentiable simulation in f64 on a CPU, compiled once for repeated runs, also with another stiffness map.
+
+    Args:
+        plan: plan of the scene.
+        device: device of the kernels, a CPU.
+        cores: number of CPU cores of a dynamic scene; None for all.
 
     Raises:
         SceneError: when a probe has a path, or the memory does not suffice.
@@ -118,7 +127,7 @@ class Adjoint:
             MsmError: when `run` has not been called.
         """
         if not self._ran:
-            raise MsmError("nothing has run yet that could be differentiated; call run first")
+            raise MsmError("no run to differentiate; call run first")
         plan, by_position = self._sheet.plan, as_array(by_position, "slope")
         shape = plan.grid.frames + 1, *plan.scene.sheet.points, 3
         if not is_real_array(by_position, shape) or not np.isfinite(by_position).all():

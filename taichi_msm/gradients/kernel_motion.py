@@ -63,6 +63,7 @@ class AdjointSheet(NamedTuple):
     """Arrays of a `KernelSheet`, extended for the adjoint."""
 
     u: Any  # p, q and the derivative of the loss; with bending also the moments of p
+    # by_column, stiffness, fields, constants, rows, width: as in `KernelSheet`
     by_column: Any
     stiffness: Any
     fields: Any
@@ -91,8 +92,8 @@ class AdjointBand(NamedTuple):
 class LoadTables(NamedTuple):
     """Loads of every step, and the derivatives with respect to them."""
 
-    loads: Any
-    by_load: Any
+    loads: Any  # shape (steps, columns)
+    by_load: Any  # shape (steps, rows, slots x 5)
 
 
 def _build_run_worker(step_band: Callable[..., None], *, parallel: bool) -> Callable[..., None]:
@@ -158,8 +159,12 @@ def _build_store_moments(code: KernelConfig) -> list[Callable[..., None]]:
 def build_store(code: KernelConfig, *, parallel: bool) -> Callable[..., None]:
     """Build the kernel that steps forward and stores all displacements.
 
-    Its arguments `sizes` (int64, indices from `COUNT` on) and `progress` (int64, `STRIDE` per worker) are also those of
-    `build_sweep`.
+    Args:
+        code: terms and number types of the kernel.
+        parallel: whether the workers run in parallel; otherwise one thread runs the steps of all workers in turn.
+
+    Returns:
+        The kernel `store`.
     """
     real, vector, vectors = code.real, code.vector, code.vectors
     count_of_numbers, join_strips, step = code.first_constant(None), build_join_strips(code), build_point_step(code)
@@ -207,6 +212,16 @@ def build_store(code: KernelConfig, *, parallel: bool) -> Callable[..., None]:
         d_x: vectors, d_y: vectors, d_z: vectors,
         constants_of: ti.types.ndarray(dtype=vector, ndim=1), by_column: vectors, stiffness: vectors, fields: vectors,
     ):  # fmt: skip
+        """Step forward.
+
+        Args:
+            sizes: sizes of the launch, with indices from `COUNT` on, shape (11,).
+            progress: steps finished by each worker, at multiples of `STRIDE`, shape (STRIDE workers,).
+            loads: loads of every step, as in `Dynamics.step_table`, shape (steps, columns).
+            u_x, u_y, u_z: displacements of all steps [m], then the workers' moments and carried forces.
+            d_x, d_y, d_z: last differences of the displacements [m], updated.
+            constants_of, by_column, stiffness, fields: arrays of the sheet, see `KernelSheet`.
+        """
         ti.loop_config(serialize=not parallel)
         for index in range(ti.cast(sizes[WORKERS], ti.i32) * ITERATIONS_PER_THREAD):
             if index % ITERATIONS_PER_THREAD == 0:
@@ -365,7 +380,15 @@ def _build_sweep_row(code: KernelConfig) -> Callable[..., None]:
 
 @cache
 def build_sweep(code: KernelConfig, *, parallel: bool) -> Callable[..., None]:
-    """Build the kernel that sweeps the adjoint, from the last step to the first."""
+    """Build the kernel that sweeps the adjoint, from the last step to the first.
+
+    Args:
+        code: terms and number types of the kernel.
+        parallel: whether the workers run in parallel; otherwise one thread runs the steps of all workers in turn.
+
+    Returns:
+        The kernel `sweep`.
+    """
     real, vector, vectors, count_of_numbers = code.real, code.vector, code.vectors, code.first_constant(None)
     join_strips, storing = build_join_strips(code), _build_store_moments(code)
     sweep_row = _build_sweep_row(code)
@@ -405,6 +428,17 @@ def build_sweep(code: KernelConfig, *, parallel: bool) -> Callable[..., None]:
         constants_of: ti.types.ndarray(dtype=vector, ndim=1),
         by_column: vectors, stiffness: vectors, fields: vectors, derivatives: vectors,
     ):  # fmt: skip
+        """Sweep backward.
+
+        Args:
+            sizes, progress, loads: as in `store`, with the loads of the swept steps.
+            by_load: derivatives with respect to the loads, added up over a row, shape (steps, rows, slots x 5),
+                overwritten.
+            p_x, p_y, p_z: adjoint state, see `BUFFERS`, then the workers' moments and carried forces; updated.
+            u_x, u_y, u_z: displacements of all steps of the segment [m].
+            constants_of, by_column, stiffness, fields: arrays of the sheet, see `KernelSheet`.
+            derivatives: accumulated derivatives, see `SPRING_PARTS`; updated.
+        """
         ti.loop_config(serialize=not parallel)
         for index in range(ti.cast(sizes[WORKERS], ti.i32) * ITERATIONS_PER_THREAD):
             if index % ITERATIONS_PER_THREAD == 0:
@@ -429,6 +463,14 @@ def copy_kernel(code: KernelConfig) -> Callable[..., None]:
         from_x: vectors, from_y: vectors, from_z: vectors,
         to_x: vectors, to_y: vectors, to_z: vectors,
     ):  # fmt: skip
+        """Copy three arrays.
+
+        Args:
+            entries: number of entries.
+            source, target: first entry to read, and to write.
+            from_x, from_y, from_z: arrays to read.
+            to_x, to_y, to_z: arrays to write.
+        """
         ti.loop_config(serialize=True)
         for n in range(entries):
             for a, b in ti.static(((from_x, to_x), (from_y, to_y), (from_z, to_z))):

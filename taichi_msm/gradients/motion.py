@@ -41,36 +41,40 @@ SEGMENT_BYTES = 64 * 2**20
 # single worker then finishes the launch, and its kernel may have to be compiled first.
 MAX_WAIT_CHECKS = 8 * MAX_CHECKS
 
-# Largest number of steps times mass points in a launch of the adjoint, about 0.1 s of one core.
-NODE_STEPS_PER_LAUNCH = 10_000_000
-
 Array = NDArray[np.float64]
 
 
-def segment_steps(steps: int, shape_bytes: int) -> int:
-    """Return the length of a segment [steps]. Its displacements and all checkpoints need about equal memory.
+def _segment_steps(steps: int, shape_bytes: int) -> int:
+    """Return the number of steps of a segment, whose displacements need about as much memory as all checkpoints.
 
-    `shape_bytes` is the memory of the displacements of a step, half of that of a checkpoint.
+    A checkpoint is twice as large as the displacements of a step, `shape_bytes`.
     """
     return min(steps, max(math.ceil(math.sqrt(2 * steps)), SEGMENT_BYTES // shape_bytes))
 
 
 def motion_bytes(plan: Plan) -> int:
-    """Estimate the memory of the adjoint of a dynamic sheet, without the positions at the frames [bytes]."""
+    """Return the memory of the adjoint of a dynamic sheet, without the positions at the frames [bytes]."""
     steps, shape_bytes = plan.grid.steps, 3 * 8 * math.prod(plan.scene.sheet.points)
-    segment = segment_steps(steps, shape_bytes)
+    segment = _segment_steps(steps, shape_bytes)
     return shape_bytes * (segment + 2 * -(-steps // segment) + kernels.ADJOINT_PARTS + kernels.SUM_PARTS)
 
 
 class MotionAdjoint:
-    """Adjoint of a dynamic sheet, of a plan in f64 with a stiffness map; its arguments are those of `Dynamics`."""
+    """Adjoint of a dynamic sheet.
+
+    Args:
+        plan: plan in f64 with a stiffness map.
+        device: device of the kernels, a CPU.
+        layout: memory layout and kernels; None to choose them for the plan.
+        cores: number of CPU cores; None for all.
+    """
 
     def __init__(self, plan: Plan, device: Device, layout: SheetLayout | None = None, cores: int | None = None) -> None:
         self._forward = Dynamics(plan, device, layout, cores)
         self._allocate()
 
     def restart(self, plan: Plan) -> None:
-        """Restart with the same scene or another."""
+        """Restart with a plan of the same terms, in f64 with a stiffness map."""
         self._forward.restart(plan)
         if self._allocated_for != (self.layout, plan.grid.steps):
             self._allocate()
@@ -94,7 +98,7 @@ class MotionAdjoint:
         plan = self.plan
         layout, memory = self.layout, Memory()
         row_bytes = layout.width * layout.config.lanes * 8
-        self._segment = segment_steps(plan.grid.steps, 3 * layout.rows * row_bytes)
+        self._segment = _segment_steps(plan.grid.steps, 3 * layout.rows * row_bytes)
         # The carried forces of two workers never share a page.
         self._carried_rows = 1 - (-PAGE // row_bytes)
         self._worker_rows = (MOMENT_ROWS + self._carried_rows) * layout.workers
@@ -123,7 +127,11 @@ class MotionAdjoint:
     def run(self, pause: Pause = lambda: None) -> Array:
         """Run all steps and store the checkpoints.
 
-        Returns the displacements at every frame [m], shape (F + 1, rows, cols, 3).
+        Args:
+            pause: called several times a second; an exception from it ends the run.
+
+        Returns:
+            Displacements at every frame [m], shape (F + 1, rows, cols, 3).
 
         Raises:
             DivergedError: when the sheet diverges.
@@ -145,7 +153,16 @@ class MotionAdjoint:
         return frames
 
     def backward(self, by_frame: Array, pause: Pause = lambda: None) -> tuple[SheetGradient, LoadGradient]:
-        """Sweep the adjoint of the last `run` backward in time, see `Adjoint.backward`."""
+        """Sweep the adjoint of the last `run` backward in time.
+
+        Args:
+            by_frame: derivative of the loss with respect to the displacements at every frame, shape (F + 1, rows, cols,
+                3).
+            pause: called after every launch; an exception from it ends the sweep.
+
+        Returns:
+            Derivatives with respect to the coefficients of the sheet, and to its loads.
+        """
         grid, layout = self.plan.grid, self.layout
         _, gain, _ = coefficients(self.plan)
         shares = area_shares(self.plan.scene.sheet) if layout.config.by_area else np.ones((layout.rows, layout.cols))
@@ -276,7 +293,8 @@ class MotionAdjoint:
         return arrays.constants, arrays.by_column, arrays.stiffness, arrays.fields
 
     def _max_launch_steps(self) -> int:
-        return max(1, NODE_STEPS_PER_LAUNCH // (self.layout.rows * self.layout.cols))
+        # Steps times mass points take about 0.1 s of one core.
+        return max(1, 10_000_000 // (self.layout.rows * self.layout.cols))
 
     def _sizes(self, count: int, shape: int, moment_row: int, with_loss: bool = False) -> NDArray[np.int64]:
         layout = self.layout

@@ -30,18 +30,23 @@ if TYPE_CHECKING:
 
 Array = NDArray[np.float64]
 
-# Largest residual of a linear solution, relative to the right-hand side.
+# Largest residual of a linear solution, relative to the right-hand side; a larger one means a singular stiffness.
 RESIDUAL_TOLERANCE = 1e-6
 
 
 class RestAdjoint:
-    """Adjoint of a quasi-static sheet, of a plan with a stiffness map."""
+    """Adjoint of a quasi-static sheet.
+
+    Args:
+        plan: plan in f64 with a stiffness map.
+        device: device of the kernels, a CPU.
+    """
 
     def __init__(self, plan: Plan, device: Device) -> None:
         self._forward = QuasiStatics(plan, device)
 
     def restart(self, plan: Plan) -> None:
-        """Restart with the same scene or another."""
+        """Restart with a plan of the same terms, in f64 with a stiffness map."""
         self._forward.restart(plan)
 
     @property
@@ -50,7 +55,13 @@ class RestAdjoint:
         return self._forward.plan
 
     def run(self, pause: Pause) -> Array:
-        """Solve all frames; return the displacements at every frame [m], shape (F + 1, rows, cols, 3).
+        """Solve all frames.
+
+        Args:
+            pause: called several times a second; an exception from it ends the solution.
+
+        Returns:
+            Displacements at every frame [m], shape (F + 1, rows, cols, 3).
 
         Raises:
             DivergedError: when a frame has no equilibrium.
@@ -63,7 +74,15 @@ class RestAdjoint:
         return self._displacements.copy()
 
     def backward(self, by_frame: Array, pause: Pause) -> tuple[SheetGradient, LoadGradient]:
-        """Differentiate a loss at the last `run`, see `Adjoint.backward`.
+        """Differentiate a loss at the last `run`.
+
+        Args:
+            by_frame: derivative of the loss with respect to the displacements at every frame, shape (F + 1, rows, cols,
+                3).
+            pause: called several times a second; an exception from it ends the differentiation.
+
+        Returns:
+            Derivatives with respect to the coefficients of the sheet, and to its loads.
 
         Raises:
             MsmError: when the tangent stiffness is singular.
@@ -90,7 +109,7 @@ class RestAdjoint:
                     "pretension or bending"
                 )
             if p is None:
-                continue  # a flat sheet remains flat with any material
+                continue  # A flat sheet remains flat with any material.
             _add_springs(gradient, families, u, p)
             gradient.foundation_stiffening += [
                 float((by_number * p[..., 2]).sum())

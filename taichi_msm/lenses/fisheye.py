@@ -7,7 +7,7 @@ With r = |(x, y)| and t = atan(r),
 Source: OpenCV's documentation of calib3d, "Fisheye camera model".
 """
 
-# No `from __future__ import annotations` here: Taichi reads the function of a lens.
+# Without `from __future__ import annotations`, because Taichi reads the function of a lens.
 
 import math
 from collections.abc import Callable, Sequence
@@ -29,7 +29,6 @@ class Fisheye(LensModel):
     coefficients: ClassVar = {name: Coefficient("radial coefficient") for name in ("k1", "k2", "k3", "k4")}
 
     def build(self, operations: Operations) -> Callable[..., Any]:
-        """Build the formula."""
         sqrt, arctan, maximum = operations.sqrt, operations.arctan, operations.maximum
 
         def distort(x, y, k1, k2, k3, k4):

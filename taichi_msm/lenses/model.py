@@ -1,7 +1,7 @@
-"""Interface of a lens model, and what NumPy and kernels share of it.
+"""Interface of a lens model.
 
 A lens maps normalised image coordinates (x, y), the intersection of a line of sight with the plane at depth 1 in
-OpenCV's axes (x right, y down), to distorted ones. Its formula is plain arithmetic: NumPy calls it as it is, kernels
+OpenCV's axes (x right, y down), to distorted ones. Its formula is plain arithmetic: NumPy calls it unchanged, kernels
 call it wrapped by Taichi, and with dual numbers it returns its derivatives.
 """
 
@@ -33,19 +33,19 @@ class Operations(NamedTuple):
     sqrt: Callable[..., Any]
     arctan: Callable[..., Any]
     maximum: Callable[..., Any]
-    wrap: Callable[[Callable[..., Any]], Callable[..., Any]]  # makes a function callable by other functions of a lens
+    wrap: Callable[[Callable[..., Any]], Callable[..., Any]]  # makes a function callable in the formula of a lens
 
 
 NUMPY = Operations(np.sqrt, np.arctan, np.maximum, lambda function: function)
 
 
 class Coefficient(NamedTuple):
-    """A coefficient of a lens model: its meaning, for users, its range, and its default; None if it is required."""
+    """A coefficient of a lens model."""
 
-    meaning: str
+    meaning: str  # for users, with its unit; without one it is a pure number
     least: float = -MAX_COEFFICIENT
     most: float = MAX_COEFFICIENT
-    default: float | None = 0.0
+    default: float | None = 0.0  # None if it is required
 
 
 class LensModel(ABC):
@@ -53,19 +53,27 @@ class LensModel(ABC):
 
     name: ClassVar[str]  # value of `distortion.model`, and of `model` in camera.json
     meaning: ClassVar[str]  # for users
-    coefficients: ClassVar[Mapping[str, Coefficient]]  # in the order of camera.json; at most 8, the place in `uniforms`
-    focal_length: ClassVar[str] = ""  # the coefficient that stands in place of fx and fy, if there is one
+    coefficients: ClassVar[Mapping[str, Coefficient]]  # in the order of camera.json; at most 8, the space in `uniforms`
+    focal_length: ClassVar[str] = ""  # coefficient that replaces fx and fy; empty without one
 
     @abstractmethod
     def build(self, operations: Operations) -> Callable[..., Any]:
-        """Build distort(x, y, *coefficients), which returns the distorted x and y."""
+        """Build the formula distort(x, y, *coefficients), which returns the distorted x and y."""
 
     @abstractmethod
     def limit(self, coefficients: Sequence[float]) -> float:
         """Return the least radius at which the distortion folds back or has a pole, at most `MAX_RADIUS`."""
 
     def undistort(self, distorted: Array, coefficients: Sequence[float]) -> Array | None:
-        """Invert the formula in closed form, with NaN beyond the limit; None if only Newton's method can."""
+        """Return the inverse of the formula in closed form, or None for a model that has none.
+
+        Args:
+            distorted: distorted normalised image coordinates, shape (..., 2).
+            coefficients: all coefficients, in the order of the model.
+
+        Returns:
+            Undistorted coordinates, shape (..., 2), NaN beyond the limit; None if Newton's method is necessary.
+        """
         return None
 
     def without_tangential(self, coefficients: Sequence[float]) -> tuple[float, ...]:

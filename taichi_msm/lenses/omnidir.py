@@ -9,7 +9,7 @@ where the rational model distorts it, with k1, k2, p1 and p2 only.
 Source: Mei and Rives 2007; OpenCV's documentation of ccalib, "Omnidirectional Camera Calibration".
 """
 
-# No `from __future__ import annotations` here: Taichi reads the function of a lens.
+# Without `from __future__ import annotations`, because Taichi reads the function of a lens.
 
 import math
 from collections.abc import Callable, Sequence
@@ -33,7 +33,6 @@ class Omnidir(LensModel):
     }
 
     def build(self, operations: Operations) -> Callable[..., Any]:
-        """Build the formula."""
         sqrt, rational = operations.sqrt, operations.wrap(Rational().build(operations))
 
         def distort(x, y, xi, k1, k2, p1, p2):

@@ -8,7 +8,7 @@ With q = x^2 + y^2,
 Source: OpenCV's documentation of calib3d, "Detailed Description".
 """
 
-# No `from __future__ import annotations` here: Taichi reads the function of a lens.
+# Without `from __future__ import annotations`, because Taichi reads the function of a lens.
 
 import math
 from collections.abc import Callable, Sequence
@@ -37,8 +37,6 @@ class Rational(LensModel):
     }
 
     def build(self, operations: Operations) -> Callable[..., Any]:
-        """Build the formula."""
-
         def distort(x, y, k1, k2, p1, p2, k3, k4, k5, k6):
             q = x * x + y * y
             ratio = (1.0 + q * (k1 + q * (k2 + q * k3))) / (1.0 + q * (k4 + q * (k5 + q * k6)))

@@ -1,15 +1,15 @@
 """Scaramuzza's polynomial model of wide lenses, as OCamCalib, MATLAB's fisheyeIntrinsics and C3VD calibrate it.
 
-A point (u, v) of the sensor [px], at the distance p from the axis, sees along (u, v, f), and its pixel is
+The line of sight of a point (u, v) of the sensor [px], at the distance p from the axis, is (u, v, f), and its pixel is
 
     (c u + d v, e u + v) from the principal point,    f(p) = a0 + a2 p^2 + a3 p^3 + a4 p^4.
 
-So p solves p = r f(p), r = |(x, y)|. Here in units of the focal length a0: t = p / a0, g(t) = f(p) / a0.
+So p solves p = r f(p), r = |(x, y)|. In units of the focal length a0: t = p / a0, g(t) = f(p) / a0.
 
 Source: Scaramuzza, Martinelli and Siegwart 2006; MATLAB's documentation of fisheyeIntrinsics.
 """
 
-# No `from __future__ import annotations` here: Taichi reads the function of a lens.
+# Without `from __future__ import annotations`, because Taichi reads the function of a lens.
 
 from collections.abc import Callable, Sequence
 from typing import Any, ClassVar
@@ -19,9 +19,6 @@ from numpy.polynomial import Polynomial
 
 from taichi_msm.lenses.fisheye import MIN_SQUARED_RADIUS
 from taichi_msm.lenses.model import MAX_RADIUS, NUMPY, Array, Coefficient, LensModel, Operations, positive_roots
-
-# Steps of the iteration; lenses of endoscopes need 3, those that fold back 5.
-STEPS = 5
 
 
 class Scaramuzza(LensModel):
@@ -41,7 +38,6 @@ class Scaramuzza(LensModel):
     }
 
     def build(self, operations: Operations) -> Callable[..., Any]:
-        """Build the formula."""
         sqrt, maximum = operations.sqrt, operations.maximum
 
         def distort(x, y, a0, a2, a3, a4, c, d, e):
@@ -49,7 +45,8 @@ class Scaramuzza(LensModel):
             r = sqrt(maximum(x * x + y * y, MIN_SQUARED_RADIUS))
             # The solution with a3 = a4 = 0, at most the stereographic one.
             t = 2.0 * r / (1.0 + sqrt(1.0 + maximum(b2 * (-4.0), 1.0) * r * r))
-            for _ in range(STEPS):
+            # Lenses of endoscopes need 3 steps, those that fold back 5.
+            for _ in range(5):
                 # The nearer root of the parabola that touches h = t - r g; Newton's method is slow near a fold. The
                 # discriminant is 0 at the fold, just before which the lens ends.
                 h = t - r * (1.0 + t * t * (b2 + t * (b3 + t * b4)))
@@ -63,7 +60,7 @@ class Scaramuzza(LensModel):
         return distort
 
     def undistort(self, distorted: Array, coefficients: Sequence[float]) -> Array:
-        """Return (u, v) / g(t)."""
+        # (u, v) / g(t).
         a0, a2, a3, a4, c, d, e = coefficients
         x, y = np.moveaxis(distorted, -1, 0)
         u, v = np.stack([x - d * y, c * y - e * x]) / (c - d * e)

@@ -39,15 +39,14 @@ class Schedule(NamedTuple):
 
 
 def decay(probe: Probe, sheet: Sheet, at: Array | None = None) -> Array:
-    """Compute the decay factor of a probe's force at each mass point.
+    """Return the decay factor of a probe's force at each mass point, shape (rows, cols).
+
+    With `total` it is multiplied by the mass point's share of a cell's area.
 
     Args:
-        probe: the probe.
-        sheet: the sheet.
+        probe: force-controlled probe.
+        sheet: supplies the rest positions of the mass points.
         at: control point, x and y at rest [m], shape (2,); by default the first keyframe of `probe.at`.
-
-    Returns:
-        Decay factors, shape (rows, cols); with `total`, multiplied by the mass point's share of a cell's area.
     """
     law, (at_x, at_y) = probe_force(probe, sheet), control_points(probe, sheet)[1][0] if at is None else at
     x, y = axes(sheet)
@@ -56,7 +55,15 @@ def decay(probe: Probe, sheet: Sheet, at: Array | None = None) -> Array:
 
 
 def decay_gradient(probe: Probe, sheet: Sheet, at: Array | None = None) -> Array:
-    """Differentiate `decay` by x and y of the control point [1/m], shape (2, rows, cols); 0 at the control point."""
+    """Return the derivatives of `decay` by x and y of the control point [1/m], shape (2, rows, cols).
+
+    They are 0 at the control point itself, where the decay has no derivative.
+
+    Args:
+        probe: force-controlled probe.
+        sheet: supplies the rest positions of the mass points.
+        at: control point, x and y at rest [m], shape (2,); by default the first keyframe of `probe.at`.
+    """
     law, (at_x, at_y) = probe_force(probe, sheet), control_points(probe, sheet)[1][0] if at is None else at
     x, y = axes(sheet)
     off = np.stack(np.broadcast_arrays(x - at_x, y - at_y))
@@ -66,7 +73,16 @@ def decay_gradient(probe: Probe, sheet: Sheet, at: Array | None = None) -> Array
 
 
 def average_loads(plan: Plan, first: int, count: int) -> Schedule:
-    """Average the loads of a plan over each of the steps first, ..., first + count - 1."""
+    """Average the loads with the hat function of each step.
+
+    Args:
+        plan: supplies the probes, their slots and the step.
+        first: number of the first step.
+        count: number of consecutive steps.
+
+    Returns:
+        Loads of the steps first, ..., first + count - 1.
+    """
     scene, slots = plan.scene, plan.slots
     t, h = np.arange(first, first + count) / plan.grid.steps_per_second, plan.grid.step
     strength, point = np.zeros((count, len(slots), 3)), np.zeros((count, len(slots), 2))
@@ -87,7 +103,15 @@ def average_loads(plan: Plan, first: int, count: int) -> Schedule:
 
 
 def evaluate_loads(plan: Plan, t: Array) -> Schedule:
-    """Evaluate the loads at times t [s] that differ from all keyframes, without averaging, with one slot per probe."""
+    """Evaluate the loads without averaging, with one slot per probe.
+
+    Args:
+        plan: supplies the probes.
+        t: times [s] other than those of keyframes, shape (n,).
+
+    Returns:
+        Loads at these times, in place of steps.
+    """
     scene = plan.scene
     slots = plan.slots if scene.time.at_rest else probe_slots(scene.probes, scene.sheet, 0.0)
     strength, point = np.zeros((len(t), len(slots), 3)), np.zeros((len(t), len(slots), 2))
@@ -102,7 +126,15 @@ def evaluate_loads(plan: Plan, t: Array) -> Schedule:
 
 
 class FrameLoad:
-    """The load of a force-controlled probe at frames, without averaging. `moves`: whether the control point moves."""
+    """The load of a force-controlled probe at frames, without averaging.
+
+    Args:
+        probe: force-controlled probe.
+        sheet: supplies the size that converts `probe.at` to metres.
+
+    Attributes:
+        moves: whether the control point moves.
+    """
 
     def __init__(self, probe: Probe, sheet: Sheet) -> None:
         self._line, (self._times, self._points) = _load(probe), control_points(probe, sheet)
@@ -110,7 +142,14 @@ class FrameLoad:
         self._keys = np.unique(np.concatenate([self._line.times, self._times]))
 
     def at(self, frame: int, rate: float) -> tuple[float, Array]:
-        """Return the load [%] and the control point, x and y at rest [m], at a frame; those after a jump at a jump."""
+        """Return the load [%] and the control point, x and y at rest [m], shape (2,), at a frame.
+
+        At a jump the values after the jump count.
+
+        Args:
+            frame: number of the frame.
+            rate: frames per second [1/s].
+        """
         time = frame / rate
         # Frame times are rounded, so a keyframe very close to the frame counts as at the frame.
         key = float(self._keys[max(0, self._keys.searchsorted(time + FRAME_TOLERANCE / rate, "right") - 1)])
@@ -124,6 +163,13 @@ def evaluate_frame_loads(plan: Plan, frame: int) -> Schedule:
     At a jump the value after the jump counts. A keyframe within FRAME_TOLERANCE frames of the frame counts as at the
     frame. A foundation that is active only under load is active while the percent of any probe differs from 0, and from
     the first to the last keyframe of any path.
+
+    Args:
+        plan: supplies the probes and the frame rate.
+        frame: number of the frame.
+
+    Returns:
+        Loads of one step, with one slot per probe.
     """
     scene, rate = plan.scene, plan.grid.frames_per_second
     time = frame / rate
@@ -159,10 +205,15 @@ class LoadBounds:
         self._begins = self._activity.times[self._activity.before < self._activity.after]
 
     def between(self, begin: float, end: float) -> tuple[Array, bool, int]:
-        """Bound the loads of all steps in the closed time interval from `begin` to `end` [s].
+        """Bound the loads of all steps in a closed time interval.
 
-        Returns the largest force at the control point of each slot [N]; whether the virtual springs are active at any
-        time; and the number of their activations.
+        Args:
+            begin: start of the interval [s].
+            end: end of the interval [s].
+
+        Returns:
+            Largest force at the control point of each slot [N], shape (slots,); whether the virtual springs are active
+            at any time; and the number of their activations.
         """
         # The averaged load of a step depends on the whole hat.
         begin, end = begin - self._h, end + self._h
@@ -268,7 +319,7 @@ def _load(probe: Probe) -> _PiecewiseLinear:
 
 
 def _pressing_keys(probe: Probe) -> Sequence[tuple[float, float]]:
-    """Return keyframes of a function that is not 0 while a probe presses, or between the ends of its path."""
+    """Return keyframes of a function that differs from 0 while a probe presses, or between the ends of its path."""
     if probe.path is None:
         return probe.load
     begin, end = probe.path[0][0], probe.path[-1][0]

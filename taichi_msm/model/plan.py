@@ -17,8 +17,8 @@ from taichi_msm.scene.scene import Scene
 from taichi_msm.scene.sheet import Sheet
 from taichi_msm.scene.tools import Probe
 
-# Keyframes closer to an end of the hat than this fraction of its half-width count as outside, because their
-# contribution is below rounding.
+# Keyframes closer to an end of the hat than this fraction of its half-width count as outside: their contribution is
+# below rounding.
 HAT_TOLERANCE = 1e-9
 
 Array = NDArray[np.float64]
@@ -57,9 +57,15 @@ class ProbeSlot:
 
 
 def probe_slots(probes: Sequence[Probe], sheet: Sheet, h: float) -> tuple[ProbeSlot, ...]:
-    """Build the slots of all force-controlled probes, for a half-width h of the hat, the step [s].
+    """Build the slots of all force-controlled probes.
 
-    With h = 0, loads are not averaged and every probe has one slot.
+    Args:
+        probes: all probes of a scene; position-controlled tools have no slots.
+        sheet: supplies the size that converts `probe.at` to metres.
+        h: half-width of the hat, the step [s]; with 0, loads are not averaged and every probe has one slot.
+
+    Returns:
+        Slots in the order of the probes.
     """
     slots = []
     for index, probe in enumerate(probes):
@@ -77,7 +83,15 @@ def probe_slots(probes: Sequence[Probe], sheet: Sheet, h: float) -> tuple[ProbeS
 
 
 def build_slots(scene: Scene, grid: TimeGrid) -> tuple[ProbeSlot, ...]:
-    """Build the slots of a scene's probes; in a quasi-static scene loads are not averaged."""
+    """Build the slots of a scene's probes; in a quasi-static scene loads are not averaged.
+
+    Args:
+        scene: supplies the probes and the kind of motion.
+        grid: supplies the step, the half-width of the hat.
+
+    Returns:
+        Slots in the order of the probes.
+    """
     return probe_slots(scene.probes, scene.sheet, 0.0 if scene.time.at_rest else grid.step)
 
 

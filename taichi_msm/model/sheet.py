@@ -74,7 +74,7 @@ def fixed_sides(sheet: Sheet) -> tuple[Side, ...]:
     return sheet.fixed
 
 
-def held_points(scene: Scene, fixed: NDArray[np.bool_]) -> NDArray[np.bool_]:
+def _held_points(scene: Scene, fixed: NDArray[np.bool_]) -> NDArray[np.bool_]:
     """Return whether each mass point is fixed or clamped, both of shape (rows, cols)."""
     held = fixed.copy()
     for probe in scene.probes:
@@ -144,13 +144,25 @@ def read_map(stiffness_map: StiffnessMap) -> MapImage:
 
 
 def cell_factors(stiffness_map: StiffnessMap, image: MapImage, sheet: Sheet) -> Array:
-    """Interpolate the factors of a stiffness map at the centres of the cells, shape (rows - 1, cols - 1)."""
+    """Return the factors of a stiffness map at the centres of the cells, shape (rows - 1, cols - 1).
+
+    Args:
+        stiffness_map: supplies the factors of black and white.
+        image: image of the map.
+        sheet: supplies the numbers of cells.
+    """
     rows, cols = (count - 1 for count in sheet.points)
     return map_factors(stiffness_map, image, (np.arange(rows) + 0.5) / rows, (np.arange(cols) + 0.5) / cols)
 
 
 def point_factors(stiffness_map: StiffnessMap, image: MapImage, sheet: Sheet) -> Array:
-    """Interpolate the factors of a stiffness map at the mass points, shape (rows, cols)."""
+    """Return the factors of a stiffness map at the mass points, shape (rows, cols).
+
+    Args:
+        stiffness_map: supplies the factors of black and white.
+        image: image of the map.
+        sheet: supplies the numbers of mass points.
+    """
     rows, cols = (np.arange(count) / (count - 1) for count in sheet.points)
     return map_factors(stiffness_map, image, rows, cols)
 
@@ -159,8 +171,8 @@ def map_factors(stiffness_map: StiffnessMap, image: MapImage, rows: Array, cols:
     """Interpolate the factors of a stiffness map bilinearly between pixel centres, constant beyond the outermost.
 
     Args:
-        stiffness_map: the map's keys in the scene.
-        image: the map's image.
+        stiffness_map: supplies the factors of black and white.
+        image: image of the map.
         rows: distances of the sampled rows from the top, as fractions of the height, shape (m,).
         cols: distances of the sampled columns from the left, as fractions of the width, shape (n,).
 
@@ -236,9 +248,15 @@ def material_key_problems(scene: Scene) -> Iterator[Problem]:
 
 
 def tissue_problems(scene: Scene, fixed: NDArray[np.bool_], factors: Array | None) -> Iterator[Problem]:
-    """Report impossible values of keys of tissue, in a scene without `material_key_problems`.
+    """Report impossible values of keys of tissue.
 
-    `factors` are those of the stiffness; None without a readable map.
+    Args:
+        scene: scene without `material_key_problems`.
+        fixed: whether each mass point is fixed, shape (rows, cols).
+        factors: stiffness factors of the cells, shape (rows - 1, cols - 1); None without a readable map.
+
+    Yields:
+        Problems with the key, its value and a remedy.
     """
     tissue, sheet = scene.tissue, scene.sheet
     if tissue is None:
@@ -270,7 +288,7 @@ def tissue_problems(scene: Scene, fixed: NDArray[np.bool_], factors: Array | Non
     if tissue.relaxation and tissue.foundation_stiffness and tissue.foundation_active == "loaded":
         text = "loaded, but tissue that relaxes needs a foundation at all times; set foundation_active: always"
         yield Problem(("tissue", "foundation_active"), text)
-    if not has_fixed_border(held_points(scene, fixed)):
+    if not has_fixed_border(_held_points(scene, fixed)):
         bending = "plate" if tissue.bending == "plate" else f"{tissue.bending:g} N m"
         for name, value in (("pretension", f"{tissue.pretension:g} N/m"), ("bending", bending)):
             if getattr(tissue, name) != 0:

@@ -20,7 +20,15 @@ Array = NDArray[np.float64]
 
 
 def to_positions(displacement: NDArray[Any], sheet: Sheet) -> NDArray[Any]:
-    """Convert displacements [m], shape (rows, cols, 3), to positions, in place; return a read-only view."""
+    """Convert displacements to positions, in place.
+
+    Args:
+        displacement: displacements of the mass points [m], shape (rows, cols, 3), overwritten with positions.
+        sheet: supplies the rest positions.
+
+    Returns:
+        The same array, now read-only: positions [m].
+    """
     position, (x, y) = displacement, axes(sheet)
     # The sum is computed in float64 and rounded once, without a float64 copy of the sheet.
     np.add(position[..., 0], x, out=position[..., 0], casting="same_kind")
@@ -37,7 +45,7 @@ def surface_point(position: NDArray[np.floating], refine: int, sheet: Sheet, res
     Args:
         position: positions of the mass points [m], shape (rows, cols, 3).
         refine: number of vertices inserted between neighbouring mass points.
-        sheet: the sheet.
+        sheet: supplies the size.
         rest: rest position, x and y [m], shape (2,).
 
     Returns:
@@ -52,7 +60,13 @@ def surface_point(position: NDArray[np.floating], refine: int, sheet: Sheet, res
 
 
 def surface_positions(position: NDArray[np.floating], refine: int, coordinates: NDArray[np.floating]) -> Array:
-    """Compute the positions [m], shape (n, 3), of material points on the refined surface, see `surface_weights`."""
+    """Return the positions of material points on the refined surface [m], shape (n, 3).
+
+    Args:
+        position: positions of the mass points [m], shape (rows, cols, 3).
+        refine: number of vertices inserted between neighbouring mass points.
+        coordinates: fractions of the sheet's width from its left and of its height from its top, shape (n, 2).
+    """
     return _interpolate(position, refine, coordinates.astype(np.float64))[0]
 
 
@@ -61,7 +75,7 @@ def surface_weights(coordinates: Array, sheet: Sheet, refine: int) -> tuple[NDAr
 
     Args:
         coordinates: fractions of the sheet's width from its left and of its height from its top, shape (n, 2).
-        sheet: the sheet.
+        sheet: supplies the numbers of mass points.
         refine: number of vertices inserted between neighbouring mass points.
 
     Returns:
@@ -102,7 +116,7 @@ class Surface(NamedTuple):
     """Textured triangles, with vertices row by row from the top left."""
 
     vertices: NDArray[np.floating]  # positions [m], shape (vertices, 3)
-    triangles: NDArray[np.int32]  # indices of vertices, shape (triangles, 3), counter-clockwise as seen from above
+    triangles: NDArray[np.int32]  # indices of vertices, shape (triangles, 3), counter-clockwise from above
     texture_coordinates: NDArray[np.float64]  # fractions of the texture from left and from top, shape (vertices, 2)
 
 
@@ -119,8 +133,14 @@ class Solid(NamedTuple):
 def refine_surface(position: NDArray[np.floating], refine: int) -> Surface:
     """Refine the sheet bilinearly (section 2 of the paper) and triangulate it.
 
-    Between neighbouring mass points `refine` vertices are inserted. Every small quad is divided by the diagonal from
-    top left to bottom right.
+    Every small quad is divided by the diagonal from top left to bottom right.
+
+    Args:
+        position: positions of the mass points [m], shape (rows, cols, 3).
+        refine: number of vertices inserted between neighbouring mass points.
+
+    Returns:
+        Textured triangles.
     """
     vertices = _insert(_insert(position, refine, 0), refine, 1)
     rows, cols = vertices.shape[:2]
@@ -138,7 +158,13 @@ def refine_surface(position: NDArray[np.floating], refine: int) -> Surface:
 
 
 def place_instruments(scene: Scene, position: NDArray[np.floating], time: float) -> list[Solid]:
-    """Return a solid for every probe with an instrument, in the order of the probes, at a time [s]."""
+    """Return a solid for every probe with an instrument, in the order of the probes.
+
+    Args:
+        scene: supplies the probes.
+        position: positions of the mass points at this time [m], shape (rows, cols, 3).
+        time: time [s].
+    """
     moved = {tool.probe: tool for tool in build_tools(scene.probes, scene.sheet)}
     placed = []
     for index, probe in enumerate(scene.probes):
@@ -154,7 +180,17 @@ def place_instruments(scene: Scene, position: NDArray[np.floating], time: float)
 
 
 def place_instrument(instrument: Instrument, scene: Scene, position: NDArray[np.floating], rest: Array) -> Solid:
-    """Place the instrument of a force-controlled probe on the surface, where the rest position is x and y [m]."""
+    """Place the instrument of a force-controlled probe on the deformed surface.
+
+    Args:
+        instrument: shape, radius and shaft.
+        scene: supplies the sheet and its refinement.
+        position: positions of the mass points [m], shape (rows, cols, 3).
+        rest: rest position of the material point below the tip, x and y [m], shape (2,).
+
+    Returns:
+        The instrument, with its tip on the side of the surface to which the shaft points.
+    """
     axis = unit_vector(instrument.shaft)
     point, normal = surface_point(position, scene.render.refine, scene.sheet, rest)
     outward = normal if normal @ axis >= 0 else -normal

@@ -52,19 +52,29 @@ class ProbeForce(NamedTuple):
 
 
 def probe_force(probe: Probe, sheet: Sheet) -> ProbeForce:
-    """Compute the force law of a force-controlled probe; the size of the sheet's cells scales a `total`."""
+    """Return the force law of a force-controlled probe.
+
+    Args:
+        probe: force-controlled probe.
+        sheet: supplies the area of a cell, which scales a `total`.
+    """
     rim = probe.falloff * probe.radius
     if probe.total is None:
         assert probe.force is not None
         return ProbeForce(probe.force, probe.falloff, probe.offset - rim, probe.offset, by_area=False)
     dx, dy = spacing(sheet)
-    share = dx * dy / decay_integral(probe)
+    share = dx * dy / _decay_integral(probe)
     x, y, z = probe.total
     return ProbeForce((x * share, y * share, z * share), probe.falloff, 0.0 - rim, 0.0, by_area=True)
 
 
 def control_points(probe: Probe, sheet: Sheet) -> tuple[Array, Array]:
-    """Return the times [s] and control points, x and y at rest [m], of a probe's keyframes, shapes (n,) and (n, 2)."""
+    """Return the times [s], shape (n,), and control points, x and y at rest [m], shape (n, 2), of a probe's keyframes.
+
+    Args:
+        probe: force-controlled probe.
+        sheet: supplies the size that converts `probe.at` to metres.
+    """
     first = probe.at[0]
     keys = probe.at if isinstance(first, tuple) else ((0.0, *probe.at),)
     time, across, down = np.array(keys, dtype=float).T
@@ -73,12 +83,24 @@ def control_points(probe: Probe, sheet: Sheet) -> tuple[Array, Array]:
 
 
 def control_point(probe: Probe, sheet: Sheet, time: float) -> Array:
-    """Return x and y of a probe's control point at a time [s], at rest [m]; at a jump, the point after the jump."""
+    """Return a probe's control point, x and y at rest [m], shape (2,); at a jump, the point after the jump.
+
+    Args:
+        probe: force-controlled probe.
+        sheet: supplies the size that converts `probe.at` to metres.
+        time: time [s].
+    """
     return point_at(*control_points(probe, sheet), time)
 
 
 def point_at(times: Array, points: Array, time: float) -> Array:
-    """Interpolate a control point [m], shape (2,), between keyframes; at a jump, the point after the jump."""
+    """Return a control point [m], shape (2,), interpolated between keyframes; at a jump, the point after the jump.
+
+    Args:
+        times: ascending times of the keyframes [s], shape (n,).
+        points: control points at the keyframes [m], shape (n, 2).
+        time: time [s].
+    """
     # Frame times are rounded, so a keyframe very close to the time counts as reached.
     after = int(np.searchsorted(times, time + 1e-12 * max(1.0, abs(time)), side="right"))
     if after in (0, len(times)):
@@ -87,7 +109,7 @@ def point_at(times: Array, points: Array, time: float) -> Array:
     return points[after - 1] + share * (points[after] - points[after - 1])
 
 
-def decay_integral(probe: Probe) -> float:
+def _decay_integral(probe: Probe) -> float:
     """Return the integral W of the decay of a probe with `total` over an infinite sheet [m2]."""
     reach = 1 / probe.falloff
     # Powers would raise OverflowError where products become infinite.
@@ -98,8 +120,8 @@ def sum_probe_forces(probe: Probe, sheet: Sheet, refinement: int = 1) -> tuple[f
     """Sum the forces of a probe over all mass points, at 100 % and at its first control point.
 
     Args:
-        probe: a force-controlled probe.
-        sheet: the sheet.
+        probe: force-controlled probe.
+        sheet: supplies the size and the numbers of mass points.
         refinement: factor by which the cells are divided along both axes.
 
     Returns:
@@ -137,7 +159,7 @@ class ProbeRecord(TypedDict, total=False):
 
 
 def probe_records(scene: Scene) -> list[ProbeRecord]:
-    """Compute the forces of every probe of a scene; the record of a position-controlled tool is empty."""
+    """Return the forces of every probe of a scene; the record of a position-controlled tool is empty."""
     records: list[ProbeRecord] = []
     for probe in scene.probes:
         if probe.moved:
@@ -145,7 +167,7 @@ def probe_records(scene: Scene) -> list[ProbeRecord]:
             continue
         flat, (total, pressure) = 0.0, sum_probe_forces(probe, scene.sheet)
         if probe.total is not None:
-            flat = math.hypot(*probe.total) * math.pi * probe.radius * probe.radius / decay_integral(probe)
+            flat = math.hypot(*probe.total) * math.pi * probe.radius * probe.radius / _decay_integral(probe)
         records.append(ProbeRecord(total_force=total, flat_end_force=flat, largest_pressure=pressure))
     return records
 
@@ -160,7 +182,15 @@ def describe_forces(record: ProbeRecord) -> str:
 
 
 def force_warnings(scene: Scene, records: Sequence[ProbeRecord]) -> Iterator[str]:
-    """Warn of probes whose forces on this sheet do not add up to their `total`; records: from `probe_records`."""
+    """Warn of probes whose forces on this sheet do not add up to their `total`.
+
+    Args:
+        scene: supplies the probes and the sheet.
+        records: forces of all probes, from `probe_records`.
+
+    Yields:
+        Warnings with the key, the force and the likely reason.
+    """
     across, down = spacing(scene.sheet)
     cell = f"a cell of {across:.3g} x {down:.3g} m"
     for index, (probe, record) in enumerate(zip(scene.probes, records, strict=True)):
@@ -169,7 +199,7 @@ def force_warnings(scene: Scene, records: Sequence[ProbeRecord]) -> Iterator[str
         requested, applied = math.hypot(*probe.total) if probe.total is not None else 0.0, record["total_force"]
         if requested > 0 and applied <= MIN_FORCE_RATIO * requested:
             yield (
-                f"probes.{index}: {applied:.3g} N of its {requested:.3g} N reach the sheet; is the tool beside "
+                f"probes.{index}: {applied:.3g} N of its {requested:.3g} N reach the sheet; is the tool outside "
                 f"the sheet, wider than the sheet, or narrower than {cell}?"
             )
         elif requested > 0 and applied * MIN_FORCE_RATIO >= requested:

@@ -28,18 +28,16 @@ from taichi_msm.scene.tools import Probe
 from taichi_msm.shapes import SHAPES
 from taichi_msm.shapes.shape import Shape
 
-# The same between two equilibria for a rough tool, whose force depends on where mass points first touch it.
+# Largest displacement of a rough tool between two equilibria, in its radii. Its force depends on where it first touches
+# each mass point.
 ROUGH_STRIDE_RADII = 1 / 16
-
-# Largest displacement of a clamp between two equilibria, in lengths of the shortest spring at rest.
-MAX_STRIDE_SPRINGS = 0.5
 
 # A larger spacing of the mass points, in radii of the tool, makes the contact force rough and issues a warning.
 MAX_SPACING_RADII = 0.5
 COARSE_TIP_PHRASE = "which touches few of them"
 
-# Remedies suggest at most this multiple of the number of mass points.
-MAX_REFINEMENT = 4
+# Largest number of mass points that a remedy suggests, as a multiple of the sheet's.
+MAX_POINTS_RATIO = 4
 
 # A grip holds the mass points within this distance of the tip's centre, in radii of the tip.
 GRIP_RADII = 1.5
@@ -74,11 +72,17 @@ class Tool:
         return float(np.linalg.norm(np.diff(self.tip_centres, axis=0), axis=1).sum())
 
     def max_stride(self, step: float, first: int = 0) -> tuple[float, int]:
-        """Find the largest displacement of the tool [m] in a step [s], from keyframe `first` on.
+        """Find the largest displacement of the tool in a step.
 
-        Also returns the index of the keyframe at the end of its path segment. The displacement is a convex function of
-        the start of the step, as long as no keyframe enters or leaves the step. It is therefore evaluated only where
-        one does.
+        The displacement is a convex function of the start of the step, as long as no keyframe enters or leaves the
+        step. It is therefore evaluated only where one does.
+
+        Args:
+            step: time step [s].
+            first: index of the keyframe before which the path is ignored.
+
+        Returns:
+            The displacement [m], and the index of the keyframe at the end of its path segment.
         """
         begin = np.maximum([0.0, *self.times, *(self.times - step)], max(0.0, self.times[first] if first else 0.0))
         strides = np.linalg.norm(self.tip_centre(begin + step) - self.tip_centre(begin), axis=1)
@@ -96,15 +100,25 @@ class Tool:
         return x, y, z
 
     def touches(self, positions: Array, t: float) -> bool:
-        """Return whether any position [m], shape (n, 3), is in or, up to rounding, on the shape at a time t [s]."""
+        """Return whether any position is in or, up to rounding, on the shape.
+
+        Args:
+            positions: positions of mass points [m], shape (n, 3).
+            t: time [s].
+        """
         r = positions - self.tip_centre(np.array([t]))[0]
         depth, *_ = self.shape.build_depth(NUMPY)(*r.T, *self.axis, self.length, self.radius)
         return bool((depth > -1e-6 * self.radius).any())
 
     def substep_times(self, begin: float, end: float) -> Array:
-        """Divide a time interval [s] so that the tool moves by at most its stride, and if rough straight, in each part.
+        """Divide a time interval so that the tool moves by at most its stride, and if rough straight, in each part.
 
-        Returns the ends of the parts.
+        Args:
+            begin: start of the interval [s].
+            end: end of the interval [s].
+
+        Returns:
+            Ends of the parts [s], shape (parts,); the last is `end`.
         """
         count, max_stride = 1, self.stride * (1 + 1e-9)
         while True:
@@ -136,7 +150,15 @@ def touching_tools(tools: Sequence[Tool]) -> list[Tool]:
 
 
 def build_tools(probes: Sequence[Probe], sheet: Sheet) -> tuple[Tool, ...]:
-    """Build the position-controlled tools of a scene from all its probes."""
+    """Build the position-controlled tools of a scene.
+
+    Args:
+        probes: all probes of the scene; force-controlled ones are skipped.
+        sheet: supplies the size, the mass points of clamps and the fixed mass points.
+
+    Returns:
+        Tools in the order of the probes.
+    """
     height, width = sheet.size
     tools: list[Tool] = []
     for index, probe in enumerate(probes):
@@ -166,7 +188,8 @@ def _build_clamp(probe: int, side: Side, path: Array, sheet: Sheet, earlier: Seq
         points &= ~taken
     rest_tip = rest_positions(sheet)[points].sum(axis=0) / max(1, points.sum())
     solid = np.array([0.0, 0.0, 1.0]), 0.0, 0.0, SHAPES["capsule"]
-    stride = MAX_STRIDE_SPRINGS * min(spacing(sheet))
+    # Half the length of the shortest spring at rest.
+    stride = 0.5 * min(spacing(sheet))
     return Clamp(probe, path[:, 0], path[:, 1:], path[:, 3], *solid, 0.0, (), stride, side, points, rest_tip)
 
 
@@ -178,13 +201,27 @@ def unit_vector(shaft: Sequence[float]) -> Array:
 
 
 def grip_frames(grip: tuple[float, float], rate: float) -> range:
-    """Return the frames of a quasi-static scene at which a grip (start and end [s]) holds, up to rounding."""
+    """Return the frames of a quasi-static scene at which a grip holds, up to rounding.
+
+    Args:
+        grip: start and end of the grip [s].
+        rate: frames per second [1/s].
+    """
     begin, end = (max(0, math.ceil(time * rate - FRAME_TOLERANCE)) for time in grip)
     return range(begin, end)
 
 
 def path_problems(scene: Scene, tools: Sequence[Tool], grid: TimeGrid) -> Iterator[Problem]:
-    """Report tools inside the sheet at the start or too fast, quasi-static friction, and clamps that hold nothing."""
+    """Report tools inside the sheet at the start or too fast, quasi-static friction, and clamps that hold nothing.
+
+    Args:
+        scene: supplies the sheet and the kind of motion.
+        tools: position-controlled tools of the scene.
+        grid: supplies the step, which limits the speed of tools.
+
+    Yields:
+        Problems with the key, its value and a remedy.
+    """
     for tool in tools:
         key = ("probes", tool.probe, "path")
         if isinstance(tool, Clamp):
@@ -201,7 +238,12 @@ def path_problems(scene: Scene, tools: Sequence[Tool], grid: TimeGrid) -> Iterat
 
 
 def friction_problem(tool: Tool, *, at_rest: bool) -> str:
-    """Return a message about friction that tools do not have in motion, or at rest; empty if there is none."""
+    """Return a message about friction that the kind of motion does not allow; empty if it does.
+
+    Args:
+        tool: position-controlled tool.
+        at_rest: whether the scene is quasi-static.
+    """
     if tool.rough and not at_rest:
         return "rough needs time.motion: quasistatic; give Coulomb's coefficient, such as 0.3"
     if at_rest and 0 < tool.friction < math.inf:
@@ -222,9 +264,14 @@ def _clamp_problems(clamp: Clamp, scene: Scene) -> Iterator[Problem]:
 
 
 def too_fast(tool: Tool, grid: TimeGrid, first: int = 0) -> tuple[int, str] | None:
-    """Return the keyframe at the end of the fastest segment from keyframe `first` on, and a message.
+    """Return the keyframe at the end of the fastest segment, and a message about its speed.
 
     Return None if the tool is slow enough for the time step, or a clamp.
+
+    Args:
+        tool: position-controlled tool.
+        grid: supplies the step.
+        first: index of the keyframe before which the path is ignored.
     """
     stride, key = tool.max_stride(grid.step, first)
     if isinstance(tool, Clamp) or stride <= tool.stride * (1 + 1e-9):
@@ -236,7 +283,13 @@ def too_fast(tool: Tool, grid: TimeGrid, first: int = 0) -> tuple[int, str] | No
 
 
 def min_steps_per_frame(tools: Sequence[Tool], grid: TimeGrid, least: int) -> int:
-    """Compute the smallest number of steps per frame, at least `least`, with which no tool is too fast."""
+    """Return the smallest number of steps per frame with which no tool is too fast.
+
+    Args:
+        tools: position-controlled tools.
+        grid: supplies the frame rate.
+        least: lower bound of the number.
+    """
 
     def speed_ratio(tool: Tool) -> float:
         return tool.max_stride(1 / grid.frames_per_second / least)[0] / tool.stride
@@ -248,7 +301,15 @@ def min_steps_per_frame(tools: Sequence[Tool], grid: TimeGrid, least: int) -> in
 
 
 def path_warnings(scene: Scene, tools: Sequence[Tool]) -> Iterator[str]:
-    """Warn of implausible paths and grips, of tools too thin for the mesh, and of tools that intersect."""
+    """Warn of implausible paths and grips, of tools too thin for the mesh, and of tools that intersect.
+
+    Args:
+        scene: supplies the sheet and the duration.
+        tools: position-controlled tools of the scene.
+
+    Yields:
+        Warnings with the key, its value and a remedy.
+    """
     spacing_max, side, end = max(spacing(scene.sheet)), max(scene.sheet.size), scene.time.duration
     for tool in tools:
         if isinstance(tool, Clamp):
@@ -259,7 +320,7 @@ def path_warnings(scene: Scene, tools: Sequence[Tool]) -> Iterator[str]:
                 )
         elif (height_max := float(np.abs(tool.heights).max())) > side:
             yield (
-                f"probes.{tool.probe}.path: a height of {height_max:g} m beside a sheet of {side:g} m; "
+                f"probes.{tool.probe}.path: a height of {height_max:g} m, and the sheet is {side:g} m long; "
                 "heights are in metres"
             )
         if tool.times[-1] > end * (1 + 1e-9):
@@ -271,7 +332,7 @@ def path_warnings(scene: Scene, tools: Sequence[Tool]) -> Iterator[str]:
                 yield f"probes.{tool.probe}.grip from {begin:g} to {until:g} s holds nothing: no frame is between them"
         if not isinstance(tool, Clamp) and spacing_max > MAX_SPACING_RADII * tool.radius:
             points = [int(np.ceil(length / (MAX_SPACING_RADII * tool.radius))) + 1 for length in scene.sheet.size]
-            affordable = math.prod(points) <= MAX_REFINEMENT * math.prod(scene.sheet.points)
+            affordable = math.prod(points) <= MAX_POINTS_RATIO * math.prod(scene.sheet.points)
             remedy = f"try sheet.points: {points}" if affordable else "take a wider tip"
             yield (
                 f"probes.{tool.probe}: the points are {spacing_max:.3g} m apart, more than half the radius of the "
@@ -287,9 +348,14 @@ def path_warnings(scene: Scene, tools: Sequence[Tool]) -> Iterator[str]:
 
 
 def overlap(tools: Sequence[Tool], duration: float) -> tuple[int, int, float] | None:
-    """Find two capsules that intersect, at 1025 equidistant times of the scene's duration [s].
+    """Find two capsules that intersect, at 1025 equidistant times.
 
-    Returns the indices of their probes, and the first time [s]; None if no tools intersect.
+    Args:
+        tools: position-controlled tools; plates and clamps are skipped.
+        duration: duration of the scene [s].
+
+    Returns:
+        Indices of their probes, and the first time [s]; None if no tools intersect.
     """
     times = np.linspace(0, duration, 1025)
     for a, b in combinations([tool for tool in touching_tools(tools) if tool.shape.is_round], 2):
@@ -322,6 +388,11 @@ def _axis_distance(a: Tool, b: Tool, offset: Array) -> Array:
 
 
 def gap_to_sheet(tool: Tool, sheet: Sheet) -> float:
-    """Return the distance of a tool at 0 s from the sheet at rest [m], negative where it is in the sheet."""
+    """Return the distance of a tool at 0 s from the sheet at rest [m], negative where it is in the sheet.
+
+    Args:
+        tool: position-controlled tool with a shape.
+        sheet: supplies the size.
+    """
     half = np.array([sheet.size[1] / 2, sheet.size[0] / 2, 0.0])
     return tool.shape.gap(tool.tip_centre(np.zeros(1))[0], tool.axis, tool.length, tool.radius, half)

@@ -33,7 +33,7 @@ class Coefficients(NamedTuple):
 
 
 def coefficients(plan: Plan) -> Coefficients:
-    """Compute the coefficients of the steps of a plan."""
+    """Return the coefficients of the steps of a plan."""
     material, h = plan.material, plan.grid.step
     g, undamped = material.drag, h * h / material.mass
     if plan.scene.time.damping_difference == "central":
@@ -42,18 +42,28 @@ def coefficients(plan: Plan) -> Coefficients:
 
 
 def mean_force(plan: Plan, displacement: NDArray[Any], steps: int) -> NDArray[Any]:
-    """Compute the mean force [N] with the effect of a sum of displacements [m] in `steps`, beyond that of other forces.
+    """Return the mean force that displaces mass points by this much more than all other forces [N].
 
     It is m (1 + g h / 2) / h^2 times the displacement per step, or m / h^2 with backward differences.
+
+    Args:
+        plan: supplies the coefficients of the steps.
+        displacement: sum of the displacements by contact over all steps [m], any shape.
+        steps: number of steps.
     """
     return displacement / (coefficients(plan).gain * steps)
 
 
 def stability_limit(frequency: float, drag: float, difference: str) -> float:
-    """Compute the largest stable step [s] for the highest angular frequency w [rad/s] and g = C / m [1/s].
+    """Return the largest stable step [s]; infinite without stiffness and damping.
 
     It is 2 / w for central differences of the damping, and (sqrt(g^2 + 4 w^2) - g) / w^2 for backward ones, which the
-    code rearranges to avoid cancellation; infinite without stiffness and damping.
+    code rearranges to avoid cancellation.
+
+    Args:
+        frequency: highest angular frequency w [rad/s].
+        drag: g = C / m [1/s].
+        difference: difference of the damping, central or backward.
     """
     g = drag if difference == "backward" else 0.0
     limit = math.hypot(g, 2 * frequency) + g

@@ -34,14 +34,17 @@ class Bins(NamedTuple):
 
 
 def build_bins(launches: Launches, bounds: Any, cells: int, extent: tuple[int, int], size: int) -> Bins:
-    """List the cells that overlap each bin: sequentially on a CPU, in parallel on a GPU.
+    """Build the bins of a picture: sequentially on a CPU, in parallel on a GPU.
 
     Args:
         launches: launches on the device; bounded ones, of a GPU, select the parallel kernels.
-        bounds: bounding boxes as stored by `store_bounds`, on the device.
+        bounds: bounding boxes as stored by `store_bounds`, on the device, shape (cells * BOUNDS_STRIDE,).
         cells: number of cells.
         extent: width and height of the picture, in the unit of the bounds.
         size: width and height of a bin; doubled until the lists have at most `MAX_MEAN_ENTRIES` per cell and bin.
+
+    Returns:
+        The lists of the cells that overlap each bin.
     """
     if launches.bounded:
         return _build_in_parallel(launches, bounds, cells, extent, size)
@@ -83,7 +86,18 @@ def _build_in_parallel(launches: Launches, bounds: Any, cells: int, extent: tupl
 
 @ti.func
 def store_bounds(cell, left, right, top, bottom, width, height, bounds: ti.template()):
-    """Store the bounding box of a cell, clipped to the picture; all in [px] or all in [samples]."""
+    """Store the bounding box of a cell, clipped to the picture; all lengths in [px] or all in [samples].
+
+    Args:
+        cell: index of the cell.
+        left: least x of the cell.
+        right: largest x.
+        top: least y.
+        bottom: largest y.
+        width: width of the picture.
+        height: height of the picture.
+        bounds: bounding boxes, shape (cells * BOUNDS_STRIDE,), written.
+    """
     entry = cell * BOUNDS_STRIDE
     bounds[entry + FIRST_X] = ti.cast(ti.floor(ti.math.clamp(left, 0.0, MAX_BOUND)), ti.i32)
     bounds[entry + FIRST_Y] = ti.cast(ti.floor(ti.math.clamp(top, 0.0, MAX_BOUND)), ti.i32)
@@ -93,7 +107,14 @@ def store_bounds(cell, left, right, top, bottom, width, height, bounds: ti.templ
 
 @ti.func
 def is_in_bounds(cell, x, y, bounds: ti.template()):
-    """Return whether column x and row y are within the bounding box of a cell, as stored by `store_bounds`."""
+    """Return whether a sample is within the bounding box of a cell.
+
+    Args:
+        cell: index of the cell.
+        x: column of the sample.
+        y: row of the sample.
+        bounds: bounding boxes as stored by `store_bounds`.
+    """
     entry = cell * BOUNDS_STRIDE
     return (
         bounds[entry + FIRST_X] <= x
@@ -140,7 +161,13 @@ def _list_cells(cells: ti.i32, size: ti.i32, columns: ti.i32, bounds: Integers, 
 
 @ti.func
 def owner_of(item, owners, ends: ti.template()):
-    """Return the index of an item's owner among `owners`; `ends` is the end of the items of each owner."""
+    """Return the index of the owner of an item, by binary search.
+
+    Args:
+        item: index of the item; the items of an owner are consecutive.
+        owners: number of owners.
+        ends: index after the last item of each owner, shape (owners,).
+    """
     low, high = 0, owners - 1
     while low < high:
         middle = (low + high) // 2

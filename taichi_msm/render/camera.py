@@ -54,8 +54,8 @@ class View(NamedTuple):
     pinhole: bool  # whether the projection is perspective
     lens: Lens | None = None
     baseline: float = 0.0  # distance to the companion of a parallel stereo pair, along the x axis [m]
-    companion: View | None = None  # the other camera of a stereo pair, the first whose `beside` names this one
-    light_view: View | None = None  # the camera at the light; None if it is this one
+    companion: View | None = None  # second camera of the stereo pair: the first whose `beside` names this camera
+    light_view: View | None = None  # the camera at the light; None if it is this camera
 
     @property
     def lens_model(self) -> str:
@@ -81,7 +81,12 @@ class View(NamedTuple):
         return self.distort(np.stack([x / w, y / w], axis=-1))
 
     def points(self, pixels: Array, depth: Array) -> Array:
-        """Return the points [m], shape (n, 3), at undistorted pixels [px], shape (n, 2), and depths [m], shape (n,)."""
+        """Return the points [m] at pixels, shape (n, 3).
+
+        Args:
+            pixels: undistorted pixels [px], shape (n, 2).
+            depth: depths [m], shape (n,).
+        """
         right, down = ((pixels - self.centre) / self.scale * (depth[:, None] if self.pinhole else 1.0)).T
         return self.eye + np.stack([right, -down, -depth], axis=-1) @ self.axes
 
@@ -143,7 +148,11 @@ def pose(camera: View) -> list[list[float]]:
 
 
 def view(scene: Scene, time: float = 0.0) -> View:
-    """Resolve the main camera of a scene at a time [s].
+    """Return the main camera of a scene at a time.
+
+    Args:
+        scene: scene with the cameras.
+        time: time [s].
 
     Raises:
         SceneError: when any camera of the scene is invalid.
@@ -154,13 +163,19 @@ def view(scene: Scene, time: float = 0.0) -> View:
 
 
 def view_at(scene: Scene, time: float, name: str = "") -> View:
-    """Resolve a valid camera of a scene at a time [s]; without a name, the main camera."""
+    """Return the view of a valid camera of a scene at a time.
+
+    Args:
+        scene: scene with the cameras.
+        time: time [s].
+        name: name of the camera; by default the main camera.
+    """
     render = scene.render
     name = name or render.main
     result = _view_of(scene, time, name)
-    if other := render.companion(name):
-        baseline = render.all_cameras[other].baseline or 0.0  # type: ignore[union-attr]
-        result = result._replace(companion=_view_of(scene, time, other), baseline=baseline)
+    if companion := render.companion(name):
+        baseline = render.all_cameras[companion].baseline or 0.0  # type: ignore[union-attr]
+        result = result._replace(companion=_view_of(scene, time, companion), baseline=baseline)
     return result if name == render.main else result._replace(light_view=_view_of(scene, time, render.main))
 
 
@@ -188,14 +203,14 @@ def _companion(camera: Camera, scene: Scene, reference: View) -> View:
     eye = reference.eye - world_to_reference.T @ rotation.T @ translation
     if camera.has_own_lens:
         return _pinhole_at(camera, scene, Extrinsics(eye, axes, reference.distance))
-    # The reference camera, with the world moved instead: a point that is Y here is seen as one that is X = Y there.
+    # The reference camera, with the world moved instead of the camera.
     turn, move = reference.axes.T @ axes, np.eye(4)
     move[:3, :3], move[:3, 3] = turn, reference.eye - turn @ eye
     return reference._replace(matrix=reference.matrix @ move, axes=axes, eye=eye)
 
 
 def pair_transform(camera: AnyCamera) -> dict[str, Any]:
-    """Return the transform from the axes of a camera's reference camera to its own, as OpenCV's stereoCalibrate.
+    """Return the transform from a camera's reference camera to the camera, as OpenCV's stereoCalibrate.
 
     Returns:
         "beside": name of the reference camera; "rotation", 3 x 3, and "translation" [m] with X_this = R X_reference +
@@ -205,12 +220,17 @@ def pair_transform(camera: AnyCamera) -> dict[str, Any]:
         return {}
     rotation, translation = np.eye(3), [-(camera.baseline or 0.0), 0.0, 0.0]
     if camera.rotation is not None and camera.translation is not None:
-        rotation, translation = nearest_rotation(np.array(camera.rotation)), list(camera.translation)
+        rotation, translation = _nearest_rotation(np.array(camera.rotation)), list(camera.translation)
     return {"beside": camera.beside, "rotation": rotation.tolist(), "translation": translation}
 
 
 def is_moving(scene: Scene, name: str = "") -> bool:
-    """Return whether a camera moves; without a name, the main camera."""
+    """Return whether a camera moves.
+
+    Args:
+        scene: scene with the cameras.
+        name: name of the camera; by default the main camera.
+    """
     camera, _ = scene.render.origin(name or scene.render.main)
     if isinstance(camera, Camera) and camera.beside is not None:
         return is_moving(scene, camera.beside)
@@ -218,7 +238,7 @@ def is_moving(scene: Scene, name: str = "") -> bool:
 
 
 def camera_problems(scene: Scene) -> Iterator[Problem]:
-    """List the problems of the cameras of a scene and of requested labels of stereo pairs."""
+    """Yield the problems of the cameras of a scene and of requested labels of stereo pairs."""
     is_valid = True
     for name, camera in scene.render.all_cameras.items():
         problem = next(_single_camera_problems(camera, scene, name), None) if isinstance(camera, Camera) else None
@@ -231,7 +251,7 @@ def camera_problems(scene: Scene) -> Iterator[Problem]:
 
 
 def _single_camera_problems(camera: Camera, scene: Scene, name: str) -> Iterator[Problem]:
-    """List the problems of a camera, of which only the first is valid; keys are relative to its section."""
+    """Yield the problems of a camera, of which only the first is valid; keys are relative to its section."""
     if camera.beside is None:
         yield from _extrinsics_problems(camera, scene)
     else:
@@ -241,7 +261,7 @@ def _single_camera_problems(camera: Camera, scene: Scene, name: str) -> Iterator
 
 
 def _placement_problems(camera: Camera, scene: Scene, name: str) -> Iterator[Problem]:
-    """List the problems of the place of a camera with a reference camera."""
+    """Yield the problems of the rotation and translation of a camera with a reference camera."""
     key, distance = "baseline", abs(scene.render.origin(name)[1])
     if camera.rotation is not None and camera.translation is not None:
         if fault := _rotation_fault(np.array(camera.rotation)):
@@ -256,25 +276,23 @@ def _placement_problems(camera: Camera, scene: Scene, name: str) -> Iterator[Pro
 
 
 def _rotation_fault(rotation: Array) -> str:
-    """Describe the fault of a matrix that is not a rotation; empty for one within 1e-3 of a rotation."""
+    """Describe the fault of a matrix; empty within 1e-3 of a rotation."""
     deviation = np.abs(rotation @ rotation.T - np.eye(3)).max()
     if deviation <= 1e-3 and np.linalg.det(rotation) > 0:
         return ""
-    fault = f"no rotation: products of its rows are off by {deviation:.2g}"
+    fault = f"not a rotation: products of its rows are off by {deviation:.2g}"
     if np.linalg.det(rotation) < 0:
-        fault = "a mirror, no rotation"
-    return f"is {fault}; its rows are the directions to the right, down and forward, of length 1 and across each other"
+        fault = "a mirror, not a rotation"
+    return f"is {fault}; its rows are the directions to the right, down and forward, orthogonal and of length 1"
 
 
 def _pair_problems(scene: Scene) -> Iterator[Problem]:
-    """List the problems of requested labels of stereo pairs."""
+    """Yield the problems of requested labels of stereo pairs."""
     cameras = scene.render.all_cameras
     pairs = {name: companion for name in cameras if (companion := scene.render.companion(name))}
     if not pairs:
         asked = next(name for name in scene.output if OUTPUTS[name].needs_stereo_pair)
-        message = (
-            f"{asked} needs a camera beside another one; take render.cameras with {{beside: NAME, baseline: metres}}"
-        )
+        message = f"{asked} needs a stereo pair; take render.cameras with {{beside: NAME, baseline: metres}}"
         yield Problem(("output",), f"{message}, or leave it out")
     for name, companion in pairs.items() if "disparity" in scene.output else ():
         message = ""
@@ -288,7 +306,7 @@ def _pair_problems(scene: Scene) -> Iterator[Problem]:
 
 
 def _extrinsics_problems(camera: Camera, scene: Scene) -> Iterator[Problem]:
-    """List the problems of a camera's extrinsics at any frame."""
+    """Yield the problems of a camera's extrinsics at any frame."""
     place = next((name,) for name in ("eye", "pose", "poses") if getattr(camera, name) is not None)
     if camera.pose is not None and (fault := _rotation_fault(np.array(camera.pose.rotation))):
         yield Problem(("pose", "rotation"), fault)
@@ -297,7 +315,7 @@ def _extrinsics_problems(camera: Camera, scene: Scene) -> Iterator[Problem]:
         begin, end, duration = camera.poses[0][0], camera.poses[-1][0], scene.time.duration
         tolerance = FRAME_TOLERANCE / scene.time.frames_per_second
         gap = camera.poses[min(1, len(camera.poses) - 1)][0] - max(begin, 0.0)
-        # Longer gaps are those of times in other units than seconds.
+        # Such gaps mean that the unit of the times is not the second.
         if gap > 1e5 or (len(camera.poses) > 2 and gap > 5 * duration):
             message = f"its first poses are {gap:.6g} s apart, and the scene lasts {duration:g} s"
             yield Problem(place, f"{message}; set poses_time, the unit of its times: ms, us or ns")
@@ -305,7 +323,7 @@ def _extrinsics_problems(camera: Camera, scene: Scene) -> Iterator[Problem]:
             message = f"covers {begin:.12g} s to {end:.12g} s, but the scene goes from 0 s to {duration:g} s"
             remedy = "set poses_start: 0 to begin at the first pose, or another time of the file"
             if begin <= tolerance:
-                remedy = "shorten time.duration or give the poses of all of it"
+                remedy = "shorten time.duration or add poses up to its end"
             yield Problem(place, f"{message}; {remedy}")
     if camera.eye is None and extrinsics(camera, 0.0).distance < MIN_MAGNITUDE:
         message = "puts the eye on the middle of the sheet, which the light's strength depends on; move it away"
@@ -315,12 +333,12 @@ def _extrinsics_problems(camera: Camera, scene: Scene) -> Iterator[Problem]:
         when = f" at {time:g} s" if camera.moves else ""
         if camera.eye is not None:
             eye, target, up = (
-                list(interpolate_keyframes(value, time)) for value in (camera.eye, camera.target, camera.up)
+                list(_interpolate_keyframes(value, time)) for value in (camera.eye, camera.target, camera.up)
             )
-            toward = normalised(np.subtract(eye, target))
+            toward = _normalised(np.subtract(eye, target))
             if math.dist(eye, target) < MIN_MAGNITUDE:
                 yield Problem(place, f"{eye} is also the target{when}; move one of them")
-            if not np.linalg.norm(np.cross(toward, normalised(np.array(up)))) > 1e-9:
+            if not np.linalg.norm(np.cross(toward, _normalised(np.array(up)))) > 1e-9:
                 yield Problem(("up",), f"{up} is zero or along the line of sight{when}; take a direction across it")
         # Kernels multiply the matrix by the samples along a side of a pixel, in f32.
         if np.abs(_pinhole(camera, scene, time).matrix).max() > float(np.finfo(np.float32).max) / MAX_SUPERSAMPLE:
@@ -331,7 +349,7 @@ def _extrinsics_problems(camera: Camera, scene: Scene) -> Iterator[Problem]:
 
 
 def _lens_problems(camera: View) -> Iterator[Problem]:
-    """Report a fold of the lens distortion within the picture."""
+    """Yield a problem if the lens distortion folds within the picture."""
     if camera.lens is None or not np.isnan(camera.undistort(border_points(camera.size))).any():
         return
     fault = "folds back" if camera.lens.limit < MAX_RADIUS else "reaches 88 degrees"
@@ -346,7 +364,7 @@ def _lens_problems(camera: View) -> Iterator[Problem]:
     message = (
         f"{fault} at {valid_px} px from the principal point, and the picture reaches {corner_px} px; take coefficients"
     )
-    yield Problem(("distortion",), f"{message} that are good to there, or set outside: background")
+    yield Problem(("distortion",), f"{message} that are valid in the whole picture, or set outside: background")
 
 
 def border_points(size: Array) -> Array:
@@ -358,9 +376,13 @@ def border_points(size: Array) -> Array:
 
 
 def pinhole(scene: Scene, time: float = 0.0) -> Camera:
-    """Return the main camera of a scene at a time [s] as a static pinhole camera.
+    """Return the main camera of a scene at a time as a static pinhole camera.
 
     An orthographic camera becomes a pinhole camera above the sheet, at the same scale.
+
+    Args:
+        scene: scene with the cameras.
+        time: time [s].
     """
     camera = scene.render.main_camera
     if isinstance(camera, Camera):
@@ -372,7 +394,12 @@ def pinhole(scene: Scene, time: float = 0.0) -> Camera:
 
 
 def frozen_camera(camera: Camera, time: float) -> Camera:
-    """Return a camera at a time [s] as a static camera with eye, target and up."""
+    """Return a camera at a time as a static camera with eye, target and up.
+
+    Args:
+        camera: camera, possibly with keyframes or poses.
+        time: time [s].
+    """
     if camera.pose is None and not camera.moves:
         return camera
     eye, axes, distance = extrinsics(camera, time)
@@ -383,10 +410,10 @@ def frozen_camera(camera: Camera, time: float) -> Camera:
 
 
 def orbit_camera(camera: Camera, right: float, up: float) -> Camera:
-    """Rotate a static camera about its target.
+    """Return a static camera rotated about its target.
 
     Args:
-        camera: the camera.
+        camera: camera with a constant eye, target and up.
         right: angle about the normal of the sheet [rad].
         up: angle about the camera's horizontal axis [rad].
     """
@@ -434,7 +461,7 @@ def _pinhole_at(camera: Camera, scene: Scene, place: Extrinsics) -> View:
     right, up, toward = axes
     depth = -toward
     if (intrinsics := camera.intrinsics) is not None:
-        # OpenCV's first pixel has its centre at (0, 0), here at (0.5, 0.5).
+        # The centre of the first pixel is (0, 0) in OpenCV, and (0.5, 0.5) in this package.
         focal_x, focal_y = camera.focal_lengths
         x, y = intrinsics.cx + 0.5, intrinsics.cy + 0.5
     else:
@@ -461,7 +488,7 @@ def _fit(scene: Scene) -> Camera:
     and below the middle of the picture. Before the plane, half the sheet's width has the angle width / 2 / (d - b).
     """
     (height, width), (columns, lines) = scene.sheet.size, scene.render.size
-    axes = look_at_axes(OBLIQUE_DIRECTION.tolist(), (0, 0, 0), (0, 1, 0))
+    axes = _look_at_axes(OBLIQUE_DIRECTION.tolist(), (0, 0, 0), (0, 1, 0))
     a, b = height / 2 * axes[1, 1], -height / 2 * axes[2, 1]
     half_height = (1 - 2 * 0.02) * math.tan(math.radians(OBLIQUE_FOV) / 2)
     distance = max(a / half_height, width / 2 / (half_height * columns / lines) + b)
@@ -491,64 +518,58 @@ class Extrinsics(NamedTuple):
 
 
 def extrinsics(camera: Camera, time: float) -> Extrinsics:
-    """Return the extrinsics of a camera at a time [s]."""
+    """Return the extrinsics of a camera at a time.
+
+    Args:
+        camera: camera without a reference camera.
+        time: time [s].
+    """
     if camera.pose is not None:
-        rotation = nearest_rotation(np.array(camera.pose.rotation))
+        rotation = _nearest_rotation(np.array(camera.pose.rotation))
         eye = -rotation.T @ np.array(camera.pose.translation)
         return Extrinsics(eye, rotation * OPENCV_SIGNS, float(np.linalg.norm(eye)))
     if camera.poses is not None:
         assert not isinstance(camera.poses, str)
-        eye, rotation = _interpolate(camera.poses, time)
+        eye, rotation = _interpolate_poses(camera.poses, time)
         return Extrinsics(eye, rotation.T * OPENCV_SIGNS, float(np.linalg.norm(eye)))
     assert camera.eye is not None
-    eye, target, up = (interpolate_keyframes(value, time) for value in (camera.eye, camera.target, camera.up))
-    return Extrinsics(np.array(eye), look_at_axes(eye, target, up), math.dist(eye, target))
+    eye, target, up = (_interpolate_keyframes(value, time) for value in (camera.eye, camera.target, camera.up))
+    return Extrinsics(np.array(eye), _look_at_axes(eye, target, up), math.dist(eye, target))
 
 
-def look_at_axes(eye: Sequence[float], target: Sequence[float], up: Sequence[float]) -> Array:
-    """Return the axes of a camera: unit vectors right, up and toward the eye, as rows, shape (3, 3).
-
-    Args:
-        eye: position [m].
-        target: point at the centre of the picture [m].
-        up: direction that appears vertical in the picture; any length, not along the line of sight.
-    """
-    toward = normalised(np.subtract(eye, target))
-    right = normalised(np.cross(rescaled(np.array(up)), toward))
+def _look_at_axes(eye: Sequence[float], target: Sequence[float], up: Sequence[float]) -> Array:
+    """Return the axes of a camera, as rows, from its eye and target [m]; `up` has any length, and appears vertical."""
+    toward = _normalised(np.subtract(eye, target))
+    right = _normalised(np.cross(_rescaled(np.array(up)), toward))
     return np.stack([right, np.cross(toward, right), toward])
 
 
-def normalised(vector: Array) -> Array:
+def _normalised(vector: Array) -> Array:
     """Normalise a vector; the zero vector is returned unchanged."""
-    smaller = rescaled(vector)
+    smaller = _rescaled(vector)
     return smaller / (float(np.linalg.norm(smaller)) or 1.0)
 
 
-def rescaled(vector: Array) -> Array:
+def _rescaled(vector: Array) -> Array:
     """Scale a vector by a power of 2, which is exact, so that its squares neither overflow nor underflow."""
     return np.ldexp(vector, -math.frexp(float(np.abs(vector).max()))[1])
 
 
-def nearest_rotation(matrix: Array) -> Array:
+def _nearest_rotation(matrix: Array) -> Array:
     """Return the nearest orthonormal matrix."""
     left, _, right = np.linalg.svd(matrix)
     return np.asarray(left @ right)
 
 
-def interpolate_keyframes(value: Sequence[float] | Sequence[Sequence[float]], time: float) -> Sequence[float]:
-    """Interpolate keyframes of a vector linearly; it is constant outside of them.
-
-    Args:
-        value: a constant vector, shape (3,), or keyframes (time [s], x, y, z), shape (n, 4).
-        time: time [s].
-    """
+def _interpolate_keyframes(value: Sequence[float] | Sequence[Sequence[float]], time: float) -> Sequence[float]:
+    """Interpolate keyframes (time [s], x, y, z) of a vector linearly, constant outside of them; or return a vector."""
     keys = np.array(value)
     if keys.ndim == 1:
         return value  # type: ignore[return-value]
     return [float(np.interp(time, keys[:, 0], keys[:, n])) for n in (1, 2, 3)]
 
 
-def _interpolate(poses: Sequence[Sequence[float]], time: float) -> tuple[Array, Array]:
+def _interpolate_poses(poses: Sequence[Sequence[float]], time: float) -> tuple[Array, Array]:
     """Return eye and camera-to-world rotation at a time: positions interpolated linearly, rotations by slerp."""
     from scipy.spatial.transform import Rotation, Slerp
 

@@ -5,12 +5,13 @@ for the 16 lanes of AVX-512, 4 x 2 for 8 lanes, 4 x 1 for 4 lanes, and a single 
 several vectors per tile, its planes. On a CPU a band of rows of tiles is the unit of parallel work, and each worker has
 memory for one band.
 
-Arguments that the functions of kernel 2 share, and that their docstrings omit:
+Names that the functions of kernel 2 share:
 
     config                compile-time configuration
     uniforms, sizes       constants of the view; sizes and counters (uniforms.py)
     position              positions of the mass points [m], shape (rows, cols, 3)
-    rows, cols; i, j      number of rows and columns of mass points; row and column of one
+    rows, cols            number of rows and columns of mass points
+    i, j                  row and column of a mass point or a cell
     nodes                 projected mass points, as stored by `project`
     corner                first entry of a cell's upper left mass point in `nodes`
     distorted_entry       the same after lens distortion, as stored by `store_distorted`
@@ -18,7 +19,7 @@ Arguments that the functions of kernel 2 share, and that their docstrings omit:
     facing                1 if the front of a cell is visible, -1 for its back
     quad_column, quad_row column and row of sub-quads in their cell
     quad_side             side of the sub-quads, as a fraction of the cell's
-    lower                 whether the triangle below the diagonal is meant, in a cell that is not invertible
+    lower                 whether the triangle is the one below the diagonal, in a cell that is not invertible
     enlargement           fraction of its side by which that triangle is enlarged
     s, t                  coordinates on a triangle, to the right and down
     across, along         coordinates in a cell, to the right and down, from 0 to 1
@@ -46,9 +47,6 @@ from typing import Any, NamedTuple
 from taichi_msm.render import uniforms as uni
 from taichi_msm.render.labels import LABELS
 from taichi_msm.system.runtime import ti
-
-# Approximate number of rows of samples in a band, on a CPU.
-BAND_ROWS = 16
 
 # Maximum number of samples in a row of a tile.
 TILE_WIDTH = 4
@@ -114,7 +112,7 @@ class DrawingConfig(NamedTuple):
     def map_planes(self) -> int:
         """Vectors per tile of the undistortion map; 0 without lens distortion.
 
-        They are x and y, the steps to the next samples (`lens_table.undistortion_map`), and on a CPU the bounding box.
+        They are x and y, the steps to the next samples (`undistortion_map`), and on a CPU the bounding box.
         """
         return (6 if self.map_has_steps else 2) + (not self.unordered) if self.lens else 0
 
@@ -125,8 +123,8 @@ class DrawingConfig(NamedTuple):
 
     @property
     def band_rows(self) -> int:
-        """Rows of pixels in a band on a CPU."""
-        return max(1, BAND_ROWS // self.supersample)
+        """Rows of pixels in a band on a CPU: those of 16 rows of samples, at least one."""
+        return max(1, 16 // self.supersample)
 
     @property
     def band_lines(self) -> int:
@@ -175,14 +173,14 @@ class Band(NamedTuple):
     """Arguments of a kernel, and a band of the picture or a part of one; lengths are in samples."""
 
     config: DrawingConfig
-    uniforms: Any
-    sizes: Any
-    nodes: Any
-    samples: Any
-    rows: Any
+    uniforms: Any  # constants of the view (uniforms.py)
+    sizes: Any  # sizes and counters (uniforms.py)
+    nodes: Any  # projected mass points (geometry.py)
+    samples: Any  # G-buffer and undistortion map
+    rows: Any  # of mass points
     cols: Any
     subdivisions: Any  # sub-quads along a side of a cell
-    near: Any
+    near: Any  # near plane [m]
     instrument_count: Any
     width: Any  # of the picture
     height: Any
@@ -199,7 +197,15 @@ class Band(NamedTuple):
 def read_arguments(
     uniforms: ti.template(), sizes: ti.template(), nodes: ti.template(), samples: ti.template(), config: ti.template()
 ):
-    """Return the arguments of a kernel as a `Band` without extent."""
+    """Return the arguments of a kernel as a `Band` without extent.
+
+    Args:
+        uniforms: constants of the view, as returned by `view_uniforms`.
+        sizes: sizes and counters, as returned by `sizes_of`.
+        nodes: projected mass points (`geometry.py`).
+        samples: G-buffer; with lens distortion also the undistortion map.
+        config: compile-time configuration.
+    """
     rows, cols, instrument_count = sizes[uni.ROWS], sizes[uni.COLS], sizes[uni.INSTRUMENT_COUNT]
     width, height = sizes[uni.WIDTH] * config.supersample, sizes[uni.HEIGHT] * config.supersample
     subdivisions, near = uniforms[uni.SUBDIVISIONS], uniforms[uni.NEAR]
@@ -214,25 +220,51 @@ def read_arguments(
 
 @ti.func
 def triple(array: ti.template(), first):
-    """Return three numbers of an array as a list."""
+    """Return three numbers of an array as a list.
+
+    Args:
+        array: array, shape (n,).
+        first: index of the first of the numbers.
+    """
     return [array[first + n] for n in ti.static(range(3))]
 
 
 @ti.func
 def dot(a: ti.template(), b: ti.template()):
-    """Return the scalar product of lists of three components."""
+    """Return the scalar product of two vectors.
+
+    Args:
+        a: list of three components.
+        b: list of three components.
+    """
     return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
 
 
 @ti.func
 def cross(a: ti.template(), b: ti.template()):
-    """Return the vector product of lists of three components."""
+    """Return the vector product of two vectors, a list of three components.
+
+    Args:
+        a: list of three components.
+        b: list of three components.
+    """
     return [a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]]
 
 
 @ti.func
 def clip(low_x, high_x, low_y, high_y, band: ti.template()):
-    """Return first and end column, first and end row of the samples of a band within a rectangle [samples]."""
+    """Clip a rectangle to a band.
+
+    Args:
+        low_x: left edge [samples].
+        high_x: right edge [samples].
+        low_y: upper edge [samples].
+        high_y: lower edge [samples].
+        band: band, whose edges are `left`, `right`, `top` and `bottom`.
+
+    Returns:
+        First column, column after the last one, first row, and row after the last one of the samples in the rectangle.
+    """
     return (
         ti.cast(ti.math.clamp(ti.floor(low_x), band.left, band.right), ti.i32),
         ti.cast(ti.math.clamp(ti.ceil(high_x), band.left, band.right), ti.i32),
@@ -243,7 +275,19 @@ def clip(low_x, high_x, low_y, high_y, band: ti.template()):
 
 @ti.func
 def tile_range(first_column, end_column, first_row, end_row, band: ti.template()):
-    """Return first and end tile in a row, first and end row of tiles from the band's top, for the result of `clip`."""
+    """Return the tiles that a rectangle of samples overlaps.
+
+    Args:
+        first_column: first column of samples, as returned by `clip`.
+        end_column: column after the last one.
+        first_row: first row of samples.
+        end_row: row after the last one.
+        band: band, whose edges are `left`, `right`, `top` and `bottom`.
+
+    Returns:
+        First column of tiles, column after the last one; first row of tiles from the band's top, row after the last
+        one.
+    """
     tile_width, tile_height = ti.static((band.config.tile_width, band.config.tile_height))
     return (
         first_column // tile_width,
@@ -255,7 +299,13 @@ def tile_range(first_column, end_column, first_row, end_row, band: ti.template()
 
 @ti.func
 def sample_centres(left, top, config: ti.template()):
-    """Return x and y of the sample centres of a tile [samples]."""
+    """Return x and y of the sample centres of a tile [samples], one per lane.
+
+    Args:
+        left: first column of the tile [samples].
+        top: first row of the tile [samples].
+        config: compile-time configuration.
+    """
     tile_width = ti.static(config.tile_width)
     columns = config.float_vector([lane % tile_width + 0.5 for lane in ti.static(range(config.lanes))])
     lines = config.float_vector([lane // tile_width + 0.5 for lane in ti.static(range(config.lanes))])
@@ -263,29 +313,45 @@ def sample_centres(left, top, config: ti.template()):
 
 
 @ti.func
-def map_entry(entry, band: ti.template()):
+def _map_entry(entry, band: ti.template()):
     """Return the first entry of a tile in the undistortion map."""
     return band.map_start + (entry - band.first) // band.config.planes * band.config.map_planes
 
 
 @ti.func
 def undistorted_centres(left, top, entry, band: ti.template()):
-    """Return the undistorted x and y of the sample centres of a tile [samples]."""
+    """Return the undistorted x and y of the sample centres of a tile [samples], one per lane.
+
+    INVALID_COORDINATE beyond the limit of the lens.
+
+    Args:
+        left: first column of the tile [samples].
+        top: first row of the tile [samples].
+        entry: first entry of the tile in the G-buffer.
+        band: the band of the tile.
+    """
     x, y = sample_centres(left, top, band.config)
     if ti.static(band.config.has_distortion):
-        stored = map_entry(entry, band)
+        stored = _map_entry(entry, band)
         x, y = band.samples[stored], band.samples[stored + 1]
     return x, y
 
 
 @ti.func
 def tile_box(entry, left, top, band: ti.template()):
-    """Return the bounding box of the undistorted sample centres of a tile: left, right, top and bottom [samples]."""
+    """Return the bounding box of the undistorted sample centres of a tile: left, right, top and bottom [samples].
+
+    Args:
+        entry: first entry of the tile in the G-buffer.
+        left: first column of the tile [samples].
+        top: first row of the tile [samples].
+        band: the band of the tile.
+    """
     config = ti.static(band.config)
     x, y = left + 0.5, top + 0.5
     box = [x, x + (config.tile_width - 1.0), y, y + (config.tile_height - 1.0)]
     if ti.static(config.has_distortion):
-        stored = map_entry(entry, band)
+        stored = _map_entry(entry, band)
         for n in ti.static(range(4)):
             if ti.static(config.unordered):
                 box[n] = band.samples[stored + n // 2][0]
@@ -296,14 +362,24 @@ def tile_box(entry, left, top, band: ti.template()):
 
 @ti.func
 def map_steps(entry, band: ti.template()):
-    """Return the undistorted steps between samples: x and y to the right, x and y downward [samples]."""
-    steps_entry = map_entry(entry, band) + 2
+    """Return the undistorted steps between samples: x and y to the right, x and y downward [samples], one per lane.
+
+    Args:
+        entry: first entry of the tile in the G-buffer.
+        band: the band of the tile.
+    """
+    steps_entry = _map_entry(entry, band) + 2
     return [band.samples[steps_entry + n] for n in ti.static(range(4))]
 
 
 @ti.func
 def clear_tile(entry, band: ti.template()):
-    """Mark the samples of a tile as empty."""
+    """Mark the samples of a tile as empty.
+
+    Args:
+        entry: first entry of the tile in the G-buffer.
+        band: the band of the tile.
+    """
     band.samples[entry + band.config.plane.depth] = band.config.float_vector(INFINITY)
     if ti.static(len(band.config.shapes) > 0):
         band.samples[entry + band.config.plane.instrument] = band.config.float_vector(0)
@@ -311,13 +387,27 @@ def clear_tile(entry, band: ti.template()):
 
 @ti.func
 def store_visible(entry, visible, value, samples: ti.template()):
-    """Store values of one plane, whose vector is at `entry`, for the visible samples of a tile."""
+    """Store values of one plane for the visible samples of a tile.
+
+    Args:
+        entry: entry of the plane's vector in the G-buffer.
+        visible: mask of the samples, one per lane.
+        value: values, one per lane.
+        samples: G-buffer.
+    """
     samples[entry] = ti.select(visible, value, samples[entry])
 
 
 @ti.func
 def store_visible_unit(entry, visible, vector: ti.template(), samples: ti.template()):
-    """Store normalised vectors in the three planes from `entry` on, for the visible samples of a tile."""
+    """Normalise vectors, and store them in three consecutive planes for the visible samples of a tile.
+
+    Args:
+        entry: entry of the first plane's vector in the G-buffer.
+        visible: mask of the samples, one per lane.
+        vector: list of three components, each with one number per lane.
+        samples: G-buffer.
+    """
     length = ti.sqrt(dot(vector, vector))
     for n in ti.static(range(3)):
         store_visible(entry + n, visible, vector[n] / length, samples)

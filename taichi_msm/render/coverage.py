@@ -7,7 +7,7 @@ that is folded or extends behind the camera is drawn triangle by triangle instea
 The line of sight through a sample is P = O + D t, where t is the depth. `taichi_msm.shapes` intersects it with the
 instruments.
 
-To add an output per pixel, add its planes in labels.py or config.py and its values in `store_surface`.
+To add an output per pixel, add its planes in labels.py or config.py and its values in `_store_surface`.
 """
 
 from collections.abc import Callable
@@ -32,7 +32,7 @@ from taichi_msm.render.config import (
     undistorted_centres,
 )
 from taichi_msm.render.lens_kernels import store_distorted
-from taichi_msm.render.lens_table import INVALID_COORDINATE
+from taichi_msm.render.undistortion import INVALID_COORDINATE
 from taichi_msm.shapes import SHAPES
 from taichi_msm.system.runtime import ti
 
@@ -55,7 +55,7 @@ class Cell(NamedTuple):
 
 
 @ti.func
-def max_edge(p_x, p_y, q_x, q_y, box: ti.template(), facing):
+def _max_edge(p_x, p_y, q_x, q_y, box: ti.template(), facing):
     """Return the maximum of `geometry.edge` over the samples within a box; rounded alike, so that none is skipped."""
     left, right, top, bottom = ti.static(box)
     x = ti.select((q_y - p_y) * facing > 0.0, left, right)
@@ -64,19 +64,19 @@ def max_edge(p_x, p_y, q_x, q_y, box: ti.template(), facing):
 
 
 @ti.func
-def may_cover(box: ti.template(), facing, outline: ti.template()):
+def _may_cover(box: ti.template(), facing, outline: ti.template()):
     """Return whether a cell may cover samples within a box: left, right, top and bottom [samples]."""
     p, q = ti.static((outline.x, outline.y))
     return (
-        max_edge(p[0], q[0], p[2], q[2], box, -facing) >= 0.0
-        and max_edge(p[1], q[1], p[3], q[3], box, facing) > 0.0
-        and max_edge(p[0], q[0], p[1], q[1], box, facing) >= 0.0
-        and max_edge(p[2], q[2], p[3], q[3], box, -facing) > 0.0
+        _max_edge(p[0], q[0], p[2], q[2], box, -facing) >= 0.0
+        and _max_edge(p[1], q[1], p[3], q[3], box, facing) > 0.0
+        and _max_edge(p[0], q[0], p[1], q[1], box, facing) >= 0.0
+        and _max_edge(p[2], q[2], p[3], q[3], box, -facing) > 0.0
     )
 
 
 @ti.func
-def cover_tile(
+def _cover_tile(
     entry, x, y, inside, quad_column, quad_row, lower, enlargement, cell: ti.template(), band: ti.template()
 ):
     """Cover a tile of samples with sub-quads of a cell, one per sample."""
@@ -101,7 +101,7 @@ def cover_tile(
         store_visible(entry + plane.cell, visible, cell_index, band.samples)
         store_visible(entry + plane.triangle, visible, piece, band.samples)
     store_visible(entry + plane.depth, visible, depth, band.samples)
-    store_surface(entry, visible, x, y, s, t, quad_column, quad_row, triangle, cell, band)
+    _store_surface(entry, visible, x, y, s, t, quad_column, quad_row, triangle, cell, band)
 
 
 @ti.func
@@ -109,14 +109,18 @@ def cover_cell(i, j, invertible, first, end, outline: ti.template(), band: ti.te
     """Cover the samples of a band with a cell.
 
     Args:
-        i, j: row and column of the cell.
+        i: row of the cell.
+        j: column of the cell.
         invertible: whether the cell is drawn by inverting its bilinear map, instead of triangle by triangle.
-        first, end: otherwise, the first of its triangles, and the triangle after the last one.
+        first: first piece of the cell: 0, or its first triangle.
+        end: piece after the last one: 1, or the triangle after the last one.
+        outline: projected corners of the cell.
+        band: the band, whose G-buffer is updated.
     """
     config, float_vector = ti.static((band.config, band.config.float_vector))
     corner, normal_entry, distorted_entry = geometry.point_entries(i * band.cols + j, band)
     patch = ti.static(geometry.cell_patch(corner, band.cols, outline.facing, invertible, band.nodes, False))
-    cell = ti.static(cell_at(i, j, normal_entry, patch, band))
+    cell = ti.static(_cell_at(i, j, normal_entry, patch, band))
     subdivisions = ti.cast(band.subdivisions, ti.i32)
     for piece in range(first, end):
         # Two triangles per sub-quad.
@@ -159,7 +163,7 @@ def cover_cell(i, j, invertible, first, end, outline: ti.template(), band: ti.te
                 if ti.static(config.has_distortion):
                     x, y = undistorted_centres(tile_x, tile_y, entry, band)
                 if invertible:
-                    overlaps = may_cover(tile_box(entry, tile_x, tile_y, band), outline.facing, outline)
+                    overlaps = _may_cover(tile_box(entry, tile_x, tile_y, band), outline.facing, outline)
                     if overlaps:
                         # Left and upper edges belong to a cell, right and lower ones to its neighbours.
                         left_edge, right_edge, top_edge, bottom_edge = geometry.edges(x, y, outline.facing, outline)
@@ -179,7 +183,7 @@ def cover_cell(i, j, invertible, first, end, outline: ti.template(), band: ti.te
                         inside = inside & (x < INVALID_COORDINATE)
             if overlaps:
                 if pending >= 0:
-                    cover_tile(
+                    _cover_tile(
                         pending, pending_x, pending_y, pending_inside > 0.0, pending_column, pending_row, lower,
                         enlargement, cell, band,
                     )  # fmt: skip
@@ -193,17 +197,26 @@ def cover_cell(i, j, invertible, first, end, outline: ti.template(), band: ti.te
 
 
 @cache
-def compile_ray(shape: str) -> Callable[..., Any]:
+def _compile_ray(shape: str) -> Callable[..., Any]:
     """Return the Taichi function of `Shape.build_ray`."""
     return ti.func(SHAPES[shape].build_ray(Operations(ti.sqrt, ti.log, ti.max, ti.min, ti.select, ti.func)))
 
 
 @ti.func
 def intersect_instrument(x, y, index, uniforms: ti.template(), shapes: ti.template()):
-    """Intersect lines of sight with the instrument of an index; `shapes` are the shapes of all instruments.
+    """Intersect lines of sight with an instrument.
+
+    Args:
+        x: undistorted columns [samples].
+        y: undistorted rows [samples].
+        index: index of the instrument.
+        uniforms: constants of the view, as returned by `view_uniforms`.
+        shapes: names of the shapes of all instruments.
 
     Returns:
-        Depth of the first intersection [m], INFINITY without one; three components of a normal of any length.
+        Depth of the first intersection [m], INFINITY without one; three components of its outward normal, in the
+        camera's
+        frame and of any length.
     """
     base = uni.INSTRUMENTS + index * uni.INSTRUMENT_STRIDE
     tip, axis = base + uni.TIP, base + uni.AXIS
@@ -217,12 +230,12 @@ def intersect_instrument(x, y, index, uniforms: ti.template(), shapes: ti.templa
     length, radius = uniforms[base + uni.LENGTH], uniforms[base + uni.RADIUS]
     d_d, d_a = d_x * d_x + d_y * d_y + 1.0, d_x * a_x + d_y * a_y - a_z
     o_a, o_d, o_o = o_x * a_x + o_y * a_y, o_x * d_x + o_y * d_y, o_x * o_x + o_y * o_y
-    first = ti.static(compile_ray(shapes[0]))
-    t, is_hit, foot, end = first(d_d, d_a, o_a, o_d, o_o, length, radius)
+    intersect_first = ti.static(_compile_ray(shapes[0]))
+    t, is_hit, foot, end = intersect_first(d_d, d_a, o_a, o_d, o_o, length, radius)
     for shape in ti.static(shapes[1:]):
         if uniforms[base + uni.KIND] == ti.static(uni.KINDS[shape]):
-            other = ti.static(compile_ray(shape))
-            t, is_hit, foot, end = other(d_d, d_a, o_a, o_d, o_o, length, radius)
+            intersect = ti.static(_compile_ray(shape))
+            t, is_hit, foot, end = intersect(d_d, d_a, o_a, o_d, o_o, length, radius)
     is_side = end == 0.0
     return (
         ti.select(is_hit, start + t, INFINITY),
@@ -233,7 +246,7 @@ def intersect_instrument(x, y, index, uniforms: ti.template(), shapes: ti.templa
 
 
 @ti.func
-def cover_tile_with_instrument(entry, x, y, index, band: ti.template()):
+def _cover_tile_with_instrument(entry, x, y, index, band: ti.template()):
     """Cover a tile of samples with an instrument."""
     plane, samples = ti.static((band.config.plane, band.samples))
     depth, n_x, n_y, n_z = intersect_instrument(x, y, index, band.uniforms, band.config.shapes)
@@ -278,12 +291,12 @@ def cover_instruments(band: ti.template()):
                         overlaps = box[0] <= right and box[1] >= left and box[2] <= bottom and box[3] >= top
                     if overlaps:
                         x, y = undistorted_centres(tile_x, tile_y, entry, band)
-                        cover_tile_with_instrument(entry, x, y, index, band)
+                        _cover_tile_with_instrument(entry, x, y, index, band)
 
 
 @ti.func
-def cell_at(i, j, normal_entry, patch: ti.template(), band: ti.template()):
-    """Return the cell with a mass point as its upper left corner."""
+def _cell_at(i, j, normal_entry, patch: ti.template(), band: ti.template()):
+    """Return the `Cell` with a mass point as its upper left corner."""
     rows, cols = band.rows - 1, band.cols - 1
     texture_width, texture_height = band.sizes[uni.LEVELS + 1], band.sizes[uni.LEVELS + 2]
     # In f64, for the accuracy of a fraction of a texel on any sheet.
@@ -305,7 +318,16 @@ def cell_at(i, j, normal_entry, patch: ti.template(), band: ti.template()):
 
 @ti.func
 def store_point(position: ti.template(), i, j, band: ti.template()):
-    """Project a mass point; if used, also distort it and compute its normal, for tissue in camera axes."""
+    """Project a mass point; if the configuration needs them, also distort it and compute its normal.
+
+    The normal is in camera axes with tissue, otherwise in those of the world.
+
+    Args:
+        position: positions of the mass points [m], shape (rows, cols, 3).
+        i: row of the mass point.
+        j: column of the mass point.
+        band: the band, or the whole picture, whose `nodes` are written.
+    """
     config = ti.static(band.config)
     geometry.project(position, i, j, band.cols, band.uniforms, band.nodes, False)
     entry, normal_entry, distorted_entry = geometry.point_entries(i * band.cols + j, band)
@@ -326,7 +348,7 @@ def store_point(position: ti.template(), i, j, band: ti.template()):
 
 
 @ti.func
-def normal_at(across, along, cell: ti.template(), band: ti.template()):
+def _normal_at(across, along, cell: ti.template(), band: ti.template()):
     """Interpolate the normals of the mass points bilinearly; not normalised."""
     corners = ti.static(geometry.corner_entries(cell.normal, band.cols, geometry.NORMAL_STRIDE))
     a, b, c, d = [triple(band.nodes, entry) for entry in corners]
@@ -337,22 +359,22 @@ def normal_at(across, along, cell: ti.template(), band: ti.template()):
 
 
 @ti.func
-def absolute(values):
+def _absolute(values):
     """Return absolute values; `ti.abs` of a vector crashes."""
     return ti.max(values, values * (-1.0))
 
 
 @ti.func
-def headlight(normal: ti.template(), uniforms: ti.template()):
+def _headlight(normal: ti.template(), uniforms: ti.template()):
     """Return the reflected share of the headlight: the absolute cosine between normal and direction to the light."""
-    cosine = absolute(dot(normal, triple(uniforms, uni.HEADLIGHT))) / ti.max(ti.sqrt(dot(normal, normal)), 1e-30)
+    cosine = _absolute(dot(normal, triple(uniforms, uni.HEADLIGHT))) / ti.max(ti.sqrt(dot(normal, normal)), 1e-30)
     # The normal of an infinite or NaN point is NaN; the limits remove it.
     return ti.max(ti.min(cosine, 1.0), 0.0)
 
 
 @ti.func
-def footprint(entry, x, y, s, t, texels_x, texels_y, triangle: ti.template(), band: ti.template()):
-    """Return the squared size of samples on the texture in `uniforms.SHARP` texels, and the side that is visible.
+def _footprint(entry, x, y, s, t, texels_x, texels_y, triangle: ti.template(), band: ti.template()):
+    """Return the squared size of samples on the texture in `uniforms.FULL_RESOLUTION_TEXELS`, and the visible side.
 
     With x = X / w the Jacobian of (x, y) with respect to (s, t) is (R_1, D_1; R_2, D_2) / w, where R_1 = R_x - x R_w
     and so on; that of (s, t) with respect to (x, y) is its inverse. The size is the larger of width and height; the
@@ -372,24 +394,24 @@ def footprint(entry, x, y, s, t, texels_x, texels_y, triangle: ti.template(), ba
         r_2, r_1 = r_2 * map_step[0] - r_1 * map_step[1], r_1 * map_step[3] - r_2 * map_step[2]
     across_1, across_2, down_1, down_2 = d_1 * texels_x, d_2 * texels_x, r_1 * texels_y, r_2 * texels_y
     largest = ti.max(across_1 * across_1 + down_1 * down_1, across_2 * across_2 + down_2 * down_2)
-    square = largest * (scale * scale) * (1.0 / (uni.SHARP * uni.SHARP))
+    square = largest * (scale * scale) * (1.0 / (uni.FULL_RESOLUTION_TEXELS * uni.FULL_RESOLUTION_TEXELS))
     # The limit is above the footprint on any texture.
     return ti.min(square, 1e12), ti.select(scale < 0.0, -1.0, 1.0)
 
 
 @ti.func
-def distance_to_line(coordinate, right_coordinate, lower_coordinate):
+def _distance_to_line(coordinate, right_coordinate, lower_coordinate):
     """Return the distance of samples from the nearest mesh line [samples].
 
     The coordinates across the lines [cells] are those of the samples and of the next ones on the right and below.
     """
     step_right, step_down = right_coordinate - coordinate, lower_coordinate - coordinate
     slope = ti.sqrt(step_right * step_right + step_down * step_down)
-    return absolute(coordinate - ti.round(coordinate)) / ti.max(slope, 1e-12)
+    return _absolute(coordinate - ti.round(coordinate)) / ti.max(slope, 1e-12)
 
 
 @ti.func
-def store_surface(
+def _store_surface(
     entry, visible, x, y, s, t, quad_column, quad_row,
     triangle: ti.template(), cell: ti.template(), band: ti.template(),
 ):  # fmt: skip
@@ -407,14 +429,14 @@ def store_surface(
     if ti.static("normals" in config.labels):
         store_visible_unit(entry + plane.facet_x, visible, geometry.facet(x, y, triangle, band.uniforms), samples)
     if ti.static(config.headlit):
-        normal = normal_at(across, along, cell, band)
-        store_visible(entry + plane.light, visible, headlight(normal, band.uniforms), samples)
+        normal = _normal_at(across, along, cell, band)
+        store_visible(entry + plane.light, visible, _headlight(normal, band.uniforms), samples)
     if ti.static(config.tissue):
-        size, front = footprint(
+        size, front = _footprint(
             entry, x, y, s, t, cell.texels_across * quad_side, cell.texels_down * quad_side, triangle, band
         )
         # At a fold, the interpolated normal may point away from the camera; `front` moves it to the visible side.
-        normal = normal_at(across, along, cell, band)
+        normal = _normal_at(across, along, cell, band)
         store_visible(entry + plane.normal_x, visible, normal[0] * front, samples)
         store_visible(entry + plane.normal_y, visible, normal[1] * front, samples)
         store_visible(entry + plane.normal_z, visible, normal[2] * front, samples)
@@ -427,8 +449,8 @@ def store_surface(
         s_right, t_right = geometry.on_triangle(right_x, right_y, triangle)
         s_below, t_below = geometry.on_triangle(below_x, below_y, triangle)
         distance = ti.min(
-            distance_to_line(across, (quad_column + s_right) * quad_side, (quad_column + s_below) * quad_side),
-            distance_to_line(along, (quad_row + t_right) * quad_side, (quad_row + t_below) * quad_side),
+            _distance_to_line(across, (quad_column + s_right) * quad_side, (quad_column + s_below) * quad_side),
+            _distance_to_line(along, (quad_row + t_right) * quad_side, (quad_row + t_below) * quad_side),
         )
         half_width = uni.WIRE_WIDTH / 2 * config.supersample + 0.5
         store_visible(

@@ -15,8 +15,8 @@ from taichi_msm.render import uniforms as uni
 from taichi_msm.render.config import INFINITY, Bytes, DrawingConfig, Floats, Integers, clear_tile, read_arguments
 from taichi_msm.render.coverage import cover_cell, cover_instruments, store_point
 from taichi_msm.render.labels import values_per_pixel
-from taichi_msm.render.lens_table import INVALID_COORDINATE
 from taichi_msm.render.shading import resolve
+from taichi_msm.render.undistortion import INVALID_COORDINATE
 from taichi_msm.system import runtime
 from taichi_msm.system.runtime import ITERATIONS_PER_THREAD, ti
 
@@ -57,11 +57,11 @@ class Bands:
 
         Args:
             position: positions of the mass points [m], shape (rows, cols, 3).
-            uniforms: constants of the view (uniforms.py).
-            sizes: sizes and counters (uniforms.py).
+            uniforms: constants of the view, as returned by `view_uniforms`.
+            sizes: sizes and counters, as returned by `sizes_of`.
 
         Returns:
-            Colours, shape (height, width, 3), and labels for `labels_of`; undefined unless configured.
+            Colours, shape (height, width, 3), and values for `labels_of`; undefined unless configured.
         """
         config, (width, height) = self._config, self._size
         # Tiles are written completely, and the last one of a row may extend beyond the picture.
@@ -81,7 +81,7 @@ class Bands:
 
 
 def _tiled_map(table: NDArray[np.float32], config: DrawingConfig) -> NDArray[np.float32]:
-    """Rearrange an undistortion map into bands and tiles, and add the bounding box of each tile and each band."""
+    """Arrange an undistortion map in bands and tiles, and append the bounding boxes of each tile and each band."""
     rows, columns, planes = table.shape
     band_height, lines = config.band_rows * config.supersample, config.band_lines
     tile_height, tile_width = config.tile_height, config.tile_width
@@ -105,7 +105,7 @@ def _tiled_map(table: NDArray[np.float32], config: DrawingConfig) -> NDArray[np.
 
 
 @ti.func
-def project_row(position: ti.template(), i, band: ti.template()):
+def _project_row(position: ti.template(), i, band: ti.template()):
     """Project a row of mass points, and store the first and last row of the picture that it overlaps."""
     cols, nodes = ti.static((band.cols, band.nodes))
     first_row, last_row = INFINITY, -INFINITY
@@ -123,7 +123,7 @@ def project_row(position: ti.template(), i, band: ti.template()):
 
 
 @ti.func
-def project_all(position: ti.template(), band: ti.template()):
+def _project_all(position: ti.template(), band: ti.template()):
     """Project all mass points, row by row, shared among the workers; return when every row is finished.
 
     A worker waits only for rows that a running worker has taken, so a worker that starts late does not delay others.
@@ -134,7 +134,7 @@ def project_all(position: ti.template(), band: ti.template()):
         i = ti.atomic_add(sizes[uni.ROWS_TAKEN], 1)
         has_row = i < band.rows
         if has_row:
-            project_row(position, i, band)
+            _project_row(position, i, band)
             ti.atomic_add(sizes[uni.ROWS_PROJECTED], 1)
     finished = ti.atomic_add(sizes[uni.ROWS_PROJECTED], 0)
     while finished < band.rows:
@@ -142,7 +142,7 @@ def project_all(position: ti.template(), band: ti.template()):
 
 
 @ti.func
-def cover_band(band: ti.template()):
+def _cover_band(band: ti.template()):
     """Cover the samples of a band with the sheet."""
     config, cols, nodes = ti.static((band.config, band.cols, band.nodes))
     lines = (band.bottom - band.top + config.tile_height - 1) // config.tile_height
@@ -181,11 +181,24 @@ def _kernel(config: DrawingConfig) -> Callable[..., None]:
         sizes: Integers, nodes: Floats, samples: ti.types.ndarray(dtype=config.float_vector, ndim=1),
         colours: Integers if config.writes_words else Bytes, labels: Floats,
     ):  # fmt: skip
+        """Draw the picture, the labels or both, as configured.
+
+        Args:
+            position: positions of the mass points [m], shape (rows, cols, 3).
+            texels: levels of the texture, as returned by `pyramid`.
+            uniforms: constants of the view, as returned by `view_uniforms`.
+            workers: number of workers.
+            sizes: sizes and counters, as returned by `sizes_of`; the counters are 0 at the start.
+            nodes: projected mass points, written; shape (rows * cols * POINT_STRIDE + 2 * rows,).
+            samples: undistortion map, then the G-buffer of a band for each worker, written.
+            colours: red, green and blue of all pixels, row by row, as words or bytes, written.
+            labels: all pixels of one label after the other, as described by `labels.label_channels`, written.
+        """
         for index in range(workers * ITERATIONS_PER_THREAD):
             if index % ITERATIONS_PER_THREAD == 0:
                 picture = ti.static(read_arguments(uniforms, sizes, nodes, samples, config))
                 # Starting a separate parallel loop takes longer than projecting a sheet of usual size.
-                project_all(position, picture)
+                _project_all(position, picture)
                 height = sizes[uni.HEIGHT]
                 tiles_of_band = picture.tiles_across * config.band_lines
                 map_vectors = tiles_of_band * config.map_planes + int(config.has_distortion)
@@ -205,7 +218,7 @@ def _kernel(config: DrawingConfig) -> Callable[..., None]:
                                 first=first, map_start=map_start, right=picture.width, top=top, bottom=bottom
                             )
                         )
-                        cover_band(band)
+                        _cover_band(band)
                         if ti.static(len(config.shapes) > 0):
                             cover_instruments(band)
                         resolve(row, end_row, 0, sizes[uni.WIDTH], texels, colours, labels, band)

@@ -36,7 +36,7 @@ class Outline(NamedTuple):
 
     x: Any  # list of the corners' coordinates
     y: Any
-    left: Any
+    left: Any  # of the bounding box
     right: Any
     top: Any
     bottom: Any
@@ -67,7 +67,17 @@ class Triangle(NamedTuple):
 
 @ti.func
 def project(position: ti.template(), i, j, cols, uniforms: ti.template(), nodes: ti.template(), double: ti.template()):
-    """Store X, Y, w, depth, x and y of a mass point; sums are in a different order if `nodes` is f64, `double`."""
+    """Project a mass point, and store its X, Y, w, depth, x and y.
+
+    Args:
+        position: positions of the mass points [m], shape (rows, cols, 3).
+        i: row of the mass point.
+        j: column of the mass point.
+        cols: number of columns of mass points.
+        uniforms: constants of the view, as returned by `view_uniforms`.
+        nodes: projected mass points, NODE_STRIDE numbers each, written.
+        double: whether `nodes` is f64; sums are then in a different order.
+    """
     entry = (i * cols + j) * NODE_STRIDE
     x, y, z = position[i, j, 0], position[i, j, 1], position[i, j, 2]
     for n in ti.static(range(4)):
@@ -82,19 +92,35 @@ def project(position: ti.template(), i, j, cols, uniforms: ti.template(), nodes:
 
 @ti.func
 def w_at(depth, uniforms: ti.template()):
-    """Return w at a depth: for a pinhole camera the depth, otherwise 1."""
+    """Return w at a depth: for a pinhole camera the depth, otherwise 1.
+
+    Args:
+        depth: depth [m].
+        uniforms: constants of the view, as returned by `view_uniforms`.
+    """
     return depth * uniforms[uni.PINHOLE] + (1.0 - uniforms[uni.PINHOLE])
 
 
 @ti.func
 def line_of_sight(x, y, uniforms: ti.template()):
-    """Return the offsets of lines of sight from the optical axis at w = 1, to the right and up [m]."""
+    """Return the offsets of lines of sight from the optical axis at w = 1, to the right and up [m].
+
+    Args:
+        x: undistorted columns [samples].
+        y: undistorted rows [samples].
+        uniforms: constants of the view, as returned by `view_uniforms`.
+    """
     return (x - uniforms[uni.CENTRE_X]) * uniforms[uni.SPREAD_X], (uniforms[uni.CENTRE_Y] - y) * uniforms[uni.SPREAD_Y]
 
 
 @ti.func
 def point_entries(point, band: ti.template()):
-    """Return the first entries of a mass point, of its normal and of the distorted mass point in `nodes`."""
+    """Return the first entries of a mass point, of its normal and of its distorted position in `Band.nodes`.
+
+    Args:
+        point: index of the mass point, row by row.
+        band: the band, or the whole picture.
+    """
     points = band.rows * band.cols
     return (
         point * NODE_STRIDE,
@@ -105,25 +131,43 @@ def point_entries(point, band: ti.template()):
 
 @ti.func
 def corner_entry(cell, cols):
-    """Return the first entry of a cell's upper left mass point."""
+    """Return the first entry of a cell's upper left mass point in `nodes`.
+
+    Args:
+        cell: index of the cell, row by row.
+        cols: number of columns of mass points.
+    """
     return (cell // (cols - 1) * cols + cell % (cols - 1)) * NODE_STRIDE
 
 
 @ti.func
 def corner_entries(first, cols, stride: ti.template()):
-    """Return the entries of the four corners of a cell, `stride` numbers per mass point; `first` is the upper left."""
+    """Return the entries of the four corners of a cell.
+
+    Args:
+        first: entry of the upper left corner.
+        cols: number of columns of mass points.
+        stride: numbers per mass point.
+    """
     below = first + cols * stride
     return ti.static((first, first + stride, below, below + stride))
 
 
 @ti.func
 def cell_outline(corner, cols, near, nodes: ti.template()):
-    """Return the `Outline` of a cell."""
+    """Return the `Outline` of a cell.
+
+    Args:
+        corner: first entry of the cell's upper left mass point in `nodes`.
+        cols: number of columns of mass points.
+        near: near plane [m].
+        nodes: projected mass points.
+    """
     corners = ti.static(corner_entries(corner, cols, NODE_STRIDE))
     x = [nodes[entry + SCREEN] for entry in corners]
     y = [nodes[entry + SCREEN + 1] for entry in corners]
     w = [nodes[entry + 2] for entry in corners]
-    facing = facing_of(x, y)
+    facing = _facing_of(x, y)
     in_front = w[0] > near and w[1] > near and w[2] > near and w[3] > near
     behind = w[0] <= near and w[1] <= near and w[2] <= near and w[3] <= near
     left, right, top, bottom = ti.min(*x), ti.max(*x), ti.min(*y), ti.max(*y)
@@ -143,7 +187,16 @@ def is_invertible(outline: ti.template()):
 
 @ti.func
 def cell_patch(corner, cols, facing, invertible, nodes: ti.template(), double: ti.template()):
-    """Return the `Patch` of a cell; D is summed in a different order if `nodes` is f64, `double`."""
+    """Return the `Patch` of a cell.
+
+    Args:
+        corner: first entry of the cell's upper left mass point in `nodes`.
+        cols: number of columns of mass points.
+        facing: as in `Outline`.
+        invertible: as in `Patch`.
+        nodes: projected mass points.
+        double: whether `nodes` is f64; D is then summed in a different order.
+    """
     corners = ti.static(corner_entries(corner, cols, NODE_STRIDE))
     a, right, down, opposite = [ti.Vector([nodes[entry + n] for n in ti.static(range(4))]) for entry in corners]
     b, c = right - a, down - a
@@ -153,9 +206,18 @@ def cell_patch(corner, cols, facing, invertible, nodes: ti.template(), double: t
 
 @ti.func
 def edge(p_x, p_y, q_x, q_y, x, y, facing):
-    """Return twice the signed area of the triangle p, q, (x, y), times `facing`; its sign is the side of the line p q.
+    """Return twice the signed area of the triangle p, q, (x, y), whose sign is the side of the line p q.
 
     Both cells at an edge compute the same bits except for the sign.
+
+    Args:
+        p_x: column of the line's first point [samples].
+        p_y: row of the first point [samples].
+        q_x: column of the line's second point [samples].
+        q_y: row of the second point [samples].
+        x: undistorted columns [samples].
+        y: undistorted rows [samples].
+        facing: factor of the area, 1 or -1.
     """
     step_x, step_y = (q_x - p_x) * facing, (q_y - p_y) * facing
     return step_x * (y - p_y) - step_y * (x - p_x)
@@ -163,7 +225,14 @@ def edge(p_x, p_y, q_x, q_y, x, y, facing):
 
 @ti.func
 def edges(x, y, facing, outline: ti.template()):
-    """Return `edge` for the left, right, upper and lower edge of a cell; none is negative inside the cell."""
+    """Return `edge` for the left, right, upper and lower edge of a cell; none is negative inside the cell.
+
+    Args:
+        x: undistorted columns [samples].
+        y: undistorted rows [samples].
+        facing: 1 if the front of the cell is visible, -1 for its back.
+        outline: projected corners of the cell.
+    """
     p, q = ti.static((outline.x, outline.y))
     return (
         edge(p[0], q[0], p[2], q[2], x, y, -facing),
@@ -174,7 +243,7 @@ def edges(x, y, facing, outline: ti.template()):
 
 
 @ti.func
-def facing_of(x: ti.template(), y: ti.template()):
+def _facing_of(x: ti.template(), y: ti.template()):
     """Return `facing` of a cell from lists of its corners' x and y; 0 if it is folded and both sides are visible."""
     # Twice the signed areas of the triangles of three corners, positive if clockwise in the picture.
     turns = [
@@ -186,7 +255,15 @@ def facing_of(x: ti.template(), y: ti.template()):
 
 @ti.func
 def find_quads(x, y, inside, subdivisions, patch: ti.template()):
-    """Return column and row of the sub-quads of a patch at samples; 0 outside the mask `inside`."""
+    """Invert the bilinear map: return column and row of the sub-quads at samples.
+
+    Args:
+        x: undistorted columns [samples].
+        y: undistorted rows [samples].
+        inside: mask of the samples in the cell; the others are assigned sub-quad (0, 0).
+        subdivisions: sub-quads along a side of the cell.
+        patch: bilinear surface of the cell.
+    """
     coefficients = ti.static((patch.a, patch.b, patch.c, patch.d))
     a_1, b_1, c_1, d_1 = [k[0] - x * k[2] for k in coefficients]
     a_2, b_2, c_2, d_2 = [k[1] - y * k[2] for k in coefficients]
@@ -208,7 +285,17 @@ def find_quads(x, y, inside, subdivisions, patch: ti.template()):
 
 @ti.func
 def triangle_at(x, y, quad_column, quad_row, quad_side, lower, patch: ti.template()):
-    """Return the `Triangle` of a sub-quad at samples."""
+    """Return the `Triangle` of a sub-quad at samples.
+
+    Args:
+        x: undistorted columns [samples].
+        y: undistorted rows [samples].
+        quad_column: column of the sub-quads in their cell, one per lane.
+        quad_row: row of the sub-quads in their cell, one per lane.
+        quad_side: side of the sub-quads, as a fraction of the cell's.
+        lower: whether the triangle is the one below the diagonal; used only if the cell is not invertible.
+        patch: bilinear surface of the cell.
+    """
     a, b, c, d = ti.static((patch.a, patch.b, patch.c, patch.d))
     s0 = quad_column * quad_side
     t0 = quad_row * quad_side
@@ -232,7 +319,13 @@ def triangle_at(x, y, quad_column, quad_row, quad_side, lower, patch: ti.templat
 
 @ti.func
 def on_triangle(x, y, triangle: ti.template()):
-    """Return s and t on a triangle at samples."""
+    """Return s and t on a triangle at samples.
+
+    Args:
+        x: undistorted columns [samples].
+        y: undistorted rows [samples].
+        triangle: drawn triangle P + R s + D t.
+    """
     coefficients = ti.static((triangle.p, triangle.r, triangle.d))
     p_1, r_1, d_1 = [k[0] - x * k[2] for k in coefficients]
     p_2, r_2, d_2 = [k[1] - y * k[2] for k in coefficients]
@@ -242,7 +335,15 @@ def on_triangle(x, y, triangle: ti.template()):
 
 @ti.func
 def is_within(s, t, enlargement, near, triangle: ti.template()):
-    """Return whether (s, t) is in an enlarged triangle and in front of the near plane."""
+    """Return whether (s, t) is in an enlarged triangle and in front of the near plane.
+
+    Args:
+        s: coordinate on the triangle, to the right.
+        t: coordinate on the triangle, down.
+        enlargement: enlargement of the triangle, as a fraction of its side.
+        near: near plane [m].
+        triangle: drawn triangle of a sub-quad.
+    """
     larger = ti.select(triangle.below, t, s)
     smaller = ti.select(triangle.below, s, t)
     return (
@@ -255,13 +356,26 @@ def is_within(s, t, enlargement, near, triangle: ti.template()):
 
 @ti.func
 def depth_at(s, t, triangle: ti.template()):
-    """Return the depth of a triangle's plane [m]."""
+    """Return the depth of a triangle's plane [m].
+
+    Args:
+        s: coordinate on the triangle, to the right.
+        t: coordinate on the triangle, down.
+        triangle: drawn triangle of a sub-quad.
+    """
     return triangle.p[3] + triangle.r[3] * s + triangle.d[3] * t
 
 
 @ti.func
 def facet(x, y, triangle: ti.template(), uniforms: ti.template()):
-    """Return the normal of a triangle on its visible side, in OpenCV's axes."""
+    """Return the normal of a triangle on its visible side, in OpenCV's axes; a list of three components, of any length.
+
+    Args:
+        x: undistorted columns [samples].
+        y: undistorted rows [samples].
+        triangle: drawn triangle of a sub-quad.
+        uniforms: constants of the view, as returned by `view_uniforms`.
+    """
     sides = [
         [
             (k[0] - k[2] * uniforms[uni.CENTRE_X]) * uniforms[uni.SPREAD_X],
@@ -280,7 +394,17 @@ def facet(x, y, triangle: ti.template(), uniforms: ti.template()):
 
 @ti.func
 def may_cover_rows(corner, distorted_entry, cols, top, bottom, uniforms: ti.template(), nodes: ti.template()):
-    """Return whether a cell may overlap rows of a distorted picture; cheaper than `distorted_cell_bounds`."""
+    """Return whether a cell may overlap rows of a distorted picture; cheaper than `distorted_cell_bounds`.
+
+    Args:
+        corner: first entry of the cell's upper left mass point in `nodes`.
+        distorted_entry: first entry of its distorted position in `nodes`.
+        cols: number of columns of mass points.
+        top: first row [samples].
+        bottom: row after the last one [samples].
+        uniforms: constants of the view, as returned by `view_uniforms`.
+        nodes: projected mass points.
+    """
     distorted_corners = ti.static(corner_entries(distorted_entry, cols, DISTORTED_STRIDE))
     within = [nodes[entry + 2] for entry in distorted_corners]
     rows = [nodes[entry + 1] for entry in distorted_corners]
@@ -294,7 +418,15 @@ def may_cover_rows(corner, distorted_entry, cols, top, bottom, uniforms: ti.temp
 
 @ti.func
 def distorted_cell_bounds(distorted_entry, cols, outline: ti.template(), uniforms: ti.template(), nodes: ti.template()):
-    """Return the bounding box of a cell in a distorted picture, as `lens_kernels.distorted_bounds`."""
+    """Return the bounding box of a cell in a distorted picture, as `lens_kernels.distorted_bounds`.
+
+    Args:
+        distorted_entry: first entry of the distorted upper left mass point in `nodes`.
+        cols: number of columns of mass points.
+        outline: projected corners of the cell, without distortion.
+        uniforms: constants of the view, as returned by `view_uniforms`.
+        nodes: projected mass points.
+    """
     corners = ti.static(corner_entries(distorted_entry, cols, DISTORTED_STRIDE))
     within = nodes[corners[0] + 2] + nodes[corners[1] + 2] + nodes[corners[2] + 2] + nodes[corners[3] + 2] > 3.5
     distorted_x = [nodes[entry] for entry in corners]
@@ -307,7 +439,14 @@ def is_off_screen(corners: ti.template(), left, right, top, bottom):
     """Return whether a polygon, possibly partly behind the camera, is beyond an edge of the picture.
 
     For an edge x of the picture, X = x w is a plane that extends behind the camera; points beyond it have a larger X,
-    or a smaller one at the left edge. `corners` are vectors (X, Y, w, ...).
+    or a smaller one at the left edge.
+
+    Args:
+        corners: list of the corners, vectors (X, Y, w, ...).
+        left: left edge of the picture, without distortion [samples].
+        right: right edge [samples].
+        top: upper edge [samples].
+        bottom: lower edge [samples].
     """
     off_screen = False
     for axis, sign, edge in ti.static(((0, -1.0, left), (0, 1.0, right), (1, -1.0, top), (1, 1.0, bottom))):
@@ -323,10 +462,24 @@ def triangle_bounds(
     quad_column, quad_row, lower, quad_side, near, width, height,
     patch: ti.template(), uniforms: ti.template(), lens: ti.template(),
 ):  # fmt: skip
-    """Return the bounding box of a triangle of a sub-quad in the picture, and `enlargement`.
+    """Return the bounding box of a triangle of a sub-quad in the picture, and its enlargement.
 
-    The box is the least and largest x, the least and largest y [samples]; the largest is below the least if the
-    triangle is outside a picture of this width and height [samples].
+    Args:
+        quad_column: column of the sub-quad in its cell.
+        quad_row: row of the sub-quad in its cell.
+        lower: whether the triangle is the one below the diagonal.
+        quad_side: side of the sub-quad, as a fraction of the cell's.
+        near: near plane [m].
+        width: width of the picture [samples].
+        height: height of the picture [samples].
+        patch: bilinear surface of the cell.
+        uniforms: constants of the view, as returned by `view_uniforms`.
+        lens: name of the lens model; empty without lens distortion.
+
+    Returns:
+        Least and largest x, least and largest y [samples], where the largest is below the least if the triangle is
+        outside
+        the picture; and the enlargement, as a fraction of the triangle's side, that closes gaps.
     """
     a, b, c, d = ti.static((patch.a, patch.b, patch.c, patch.d))
     low_x, high_x, low_y, high_y = 0.0, ti.cast(width, ti.f32), -INFINITY, INFINITY

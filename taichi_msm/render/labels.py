@@ -58,7 +58,7 @@ def requested_labels(outputs: Collection[str]) -> frozenset[str]:
     return frozenset(name for name, label in LABELS.items() if name in outputs or not label.is_optional)
 
 
-def label_offsets(names: Collection[str]) -> Iterator[tuple[str, Label, int]]:
+def _label_offsets(names: Collection[str]) -> Iterator[tuple[str, Label, int]]:
     """List the labels of these names with the number of values per pixel before each."""
     offset = 0
     for name, label in LABELS.items():
@@ -73,7 +73,7 @@ def values_per_pixel(names: Collection[str]) -> int:
 
 
 def label_channels(plane: Any, names: Collection[str]) -> list[tuple[int, int, int, int, Label]]:
-    """List the G-buffer planes that contain labels; a label without planes is 0.
+    """List the G-buffer planes that contain labels; a label without planes stays 0.
 
     Args:
         plane: index of each plane of the G-buffer, by name.
@@ -85,16 +85,22 @@ def label_channels(plane: Any, names: Collection[str]) -> list[tuple[int, int, i
     """
     return [
         (getattr(plane, plane_name), offset, n, len(label.planes), label)
-        for _, label, offset in label_offsets(names)
+        for _, label, offset in _label_offsets(names)
         for n, plane_name in enumerate(label.planes)
         if hasattr(plane, plane_name)
     ]
 
 
 def labels_of(numbers: NDArray[np.float32], size: tuple[int, int], names: Collection[str]) -> Labels:
-    """Convert the output of kernel 2, one label after the other, to labels of a picture of a size [px]."""
+    """Return the labels of a picture.
+
+    Args:
+        numbers: output of kernel 2, all pixels of one label after the other.
+        size: width and height of the picture [px].
+        names: names of the labels.
+    """
     (width, height), arrays = size, {}
-    for name, label, offset in label_offsets(names):
+    for name, label, offset in _label_offsets(names):
         count = len(label.planes)
         values = numbers.reshape(-1, width * height)[offset : offset + count]
         arrays[name] = values.reshape((height, width, count)[: 2 + (count > 1)]).astype(label.dtype, copy=False)

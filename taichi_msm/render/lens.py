@@ -1,4 +1,4 @@
-"""A lens: a model with its coefficients, and its inverse."""
+"""A lens: a model with its coefficients, its inverse and its Jacobian, in NumPy."""
 
 from __future__ import annotations
 
@@ -21,8 +21,8 @@ UNDISTORTION_TOLERANCE = 1e-11
 class Lens(NamedTuple):
     """A lens distortion model and its coefficients."""
 
-    model: str  # its name
-    coefficients: tuple[float, ...]  # all of the model, in its order
+    model: str  # name of the model, a key of `lenses.MODELS`
+    coefficients: tuple[float, ...]  # all coefficients of the model, in its order
 
     @property
     def limit(self) -> float:

@@ -1,7 +1,7 @@
 """Lens distortion in kernels: distorted points, and bounding boxes of distorted cells and triangles.
 
-The formulas are those of `lenses`, the bounds those of `lens_table.VisibleRegion`. Undistorted points are in samples of
-the picture of the same camera without lens distortion.
+The formulas are those of `lenses`, the bounds those of `undistortion.VisibleRegion`. Undistorted points are in samples
+of the picture of the same camera without lens distortion.
 """
 
 from collections.abc import Callable
@@ -11,7 +11,7 @@ from typing import Any
 from taichi_msm.lenses import MODELS
 from taichi_msm.lenses.model import Operations
 from taichi_msm.render import uniforms as uni
-from taichi_msm.render.lens_table import INVALID_COORDINATE
+from taichi_msm.render.undistortion import INVALID_COORDINATE
 from taichi_msm.system.runtime import ti
 
 # Numbers per distorted mass point: x and y [samples]; 1 if it is in front of the camera and within the limit of the
@@ -25,7 +25,7 @@ SERIES = [(-1.0) ** n * (2 * n + 1) for n in reversed(range(12))]
 
 
 @ti.func
-def arctangent(tangent):
+def _arctangent(tangent):
     """Return the angle, 0 to pi / 2, of a tangent; GPUs have no arctangent in f64."""
     half_tangent = tangent
     for _ in ti.static(range(HALVINGS)):
@@ -42,12 +42,18 @@ def arctangent(tangent):
 @cache
 def compile_lens(lens: str) -> Callable[..., Any]:
     """Wrap the formula of a lens model for kernels."""
-    return ti.func(MODELS[lens].build(Operations(ti.sqrt, arctangent, ti.max, ti.func)))
+    return ti.func(MODELS[lens].build(Operations(ti.sqrt, _arctangent, ti.max, ti.func)))
 
 
 @ti.func
 def distorted_point(x, y, uniforms: ti.template(), lens: ti.template()):
     """Distort a point.
+
+    Args:
+        x: undistorted column [samples].
+        y: undistorted row [samples].
+        uniforms: constants of the view, as returned by `view_uniforms`.
+        lens: name of the lens model.
 
     Returns:
         x and y of the distorted point [samples]; and whether the undistorted one is within the limit of the lens.
@@ -72,7 +78,15 @@ def distorted_point(x, y, uniforms: ti.template(), lens: ti.template()):
 
 @ti.func
 def store_distorted(distorted_entry, entry, uniforms: ti.template(), nodes: ti.template(), lens: ti.template()):
-    """Distort the projected mass point at `entry` of `nodes`, and store it at `distorted_entry`."""
+    """Distort a projected mass point, and store it.
+
+    Args:
+        distorted_entry: first entry of the distorted mass point in `nodes`.
+        entry: first entry of the projected mass point in `nodes`.
+        uniforms: constants of the view, as returned by `view_uniforms`.
+        nodes: projected mass points, updated.
+        lens: name of the lens model.
+    """
     x, y, is_valid = distorted_point(nodes[entry + uni.SCREEN], nodes[entry + uni.SCREEN + 1], uniforms, lens)
     nodes[distorted_entry], nodes[distorted_entry + 1] = x, y
     nodes[distorted_entry + 2] = ti.cast(is_valid and nodes[entry + 2] > uniforms[uni.NEAR], ti.f32)
@@ -80,7 +94,12 @@ def store_distorted(distorted_entry, entry, uniforms: ti.template(), nodes: ti.t
 
 @ti.func
 def squared_length(x: ti.template(), y: ti.template()):
-    """Return the squared length of the longest side of a triangle, or of a cell with corners row by row."""
+    """Return the squared length of the longest side of a triangle or a cell.
+
+    Args:
+        x: list of the vertices' coordinates; of a cell its corners, row by row.
+        y: list of the vertices' coordinates, likewise.
+    """
     sides = ti.static(((0, 1), (1, 2), (2, 0)) if len(x) == 3 else ((0, 1), (1, 3), (3, 2), (2, 0)))
     squares = [(x[n] - x[m]) * (x[n] - x[m]) + (y[n] - y[m]) * (y[n] - y[m]) for n, m in sides]
     return ti.max(*squares)
@@ -94,9 +113,12 @@ def distorted_bounds(
     """Return the bounding box of the samples that a triangle or a cell covers after distortion.
 
     Args:
-        x, y: lists of the coordinates of the undistorted vertices [samples].
-        distorted_x, distorted_y: lists of those of the distorted vertices [samples].
+        x: list of the columns of the undistorted vertices [samples].
+        y: list of the rows of the undistorted vertices [samples].
+        distorted_x: list of the columns of the distorted vertices [samples].
+        distorted_y: list of the rows of the distorted vertices [samples].
         is_valid: whether all vertices are within the limit of the lens.
+        uniforms: constants of the view, as returned by `view_uniforms`.
 
     Returns:
         Least and largest x, least and largest y [samples]; the largest are below the least outside the picture.

@@ -16,7 +16,7 @@ from taichi_msm.scene.scene import Scene
 
 
 def drawing_warnings(scene: Scene) -> Iterator[str]:
-    """List warnings about the rendering of a scene, one line each."""
+    """Yield warnings about the rendering of a scene, one line each."""
     height, width = scene.sheet.size
     # Tissue is smaller than 5 m; a larger sheet was probably given in millimetres.
     if max(height, width) > 5.0:
@@ -27,9 +27,7 @@ def drawing_warnings(scene: Scene) -> Iterator[str]:
     if scene.draws:
         yield from _stretched_picture(scene)
         if texture.is_see_through(scene):
-            yield (
-                f"the picture is see-through in parts, which show render.background: {list(scene.render.background)}"
-            )
+            yield (f"parts of the picture are transparent, and show render.background: {list(scene.render.background)}")
         if scene.render.light != Light() and scene.render.shading != "tissue":
             yield f"render.light has no effect with shading: {scene.render.shading}; take render.shading: tissue"
     if scene.renders:
@@ -59,7 +57,7 @@ def describe_cameras(scene: Scene) -> Iterator[str]:
             baseline = np.linalg.norm(pair_transform(camera)["translation"])
             facts.append(f"beside {camera.beside} with a baseline of {baseline:.6g} m")
         if facts:
-            yield f"{camera_key(name)}: {', '.join(facts)}"
+            yield f"{_camera_key(name)}: {', '.join(facts)}"
 
 
 def _describe_lens(camera: Camera, view: View) -> str:
@@ -74,7 +72,7 @@ def _describe_lens(camera: Camera, view: View) -> str:
     return f"{distortion.model}, {width:g} x {height:g} px, fov {fov} degrees{values or ', no distortion'}"
 
 
-def camera_key(name: str) -> str:
+def _camera_key(name: str) -> str:
     """Return the key of a camera by its name."""
     return f"render.cameras.{name}" if name else "render.camera"
 
@@ -84,12 +82,12 @@ def _invisible_sheet(scene: Scene) -> Iterator[str]:
     rate = scene.time.frames_per_second
     for name in scene.render.all_cameras:
         camera = view_at(scene, 0.0, name)
-        # At 100 x 100 pixels, all miss a sheet that is only a dot, as from a camera with lengths in millimetres.
+        # A sheet that is only a dot, as from a camera with lengths in millimetres, is between all of 100 x 100 pixels.
         centres = (np.arange(100) + 0.5) / 100
         pixels = camera.undistort(np.stack(np.meshgrid(*(centres * side for side in camera.size)), axis=-1))
         frames = range(scene.time.frames + 1 if is_moving(scene, name) else 1)
         if not any(_is_visible(view_at(scene, frame / rate, name), pixels, scene.sheet.size) for frame in frames):
-            key = camera_key(name)
+            key = _camera_key(name)
             yield f"{key} shows nothing of the sheet at rest, or only a dot, in all frames; lengths are in metres"
 
 
@@ -125,14 +123,14 @@ def _stretched_picture(scene: Scene) -> Iterator[str]:
         settings += f' --set "sheet.points=[{rows},{cols}]"'
     warning = (
         f"the picture of {width} x {height} pixels is stretched onto a sheet {sheet_width:g} m wide and "
-        f"{sheet_height:g} m high; {settings} makes the sheet like the picture"
+        f"{sheet_height:g} m high; {settings} gives the sheet the proportions of the picture"
     )
     cut_width = min(width, round(height * sheet_width / sheet_height))
     cut_height = min(height, round(width * sheet_height / sheet_width))
     # In a picture of few pixels even the best region may be stretched.
     if cut_width and cut_height and _nearly_equal(sheet_width * cut_height, sheet_height * cut_width):
         region = left + (width - cut_width) // 2, top + (height - cut_height) // 2, cut_width, cut_height
-        warning += f', --set "region=[{",".join(map(str, region))}]" cuts a part like the sheet'
+        warning += f', --set "region=[{",".join(map(str, region))}]" cuts a region with the proportions of the sheet'
     yield warning
 
 

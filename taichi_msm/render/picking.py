@@ -23,7 +23,7 @@ def pick(position: NDArray[np.floating], refine: int, view: View, pixel: Pair) -
     Args:
         position: positions of the mass points [m], shape (rows, cols, 3).
         refine: vertices inserted between neighbouring mass points.
-        view: the camera.
+        view: resolved camera.
         pixel: column and row, counted from (0, 0).
 
     Returns:
@@ -44,9 +44,14 @@ def pick(position: NDArray[np.floating], refine: int, view: View, pixel: Pair) -
 
 
 def intersect_rest_plane(view: View, pixel: Pair) -> NDArray[np.floating] | None:
-    """Return x and y [m] at which the line of sight through a pixel's centre meets the plane of the sheet at rest.
+    """Intersect the line of sight through a pixel's centre with the plane of the sheet at rest.
 
-    The first pixel is (0, 0). None without an intersection in front of the camera.
+    Args:
+        view: resolved camera.
+        pixel: column and row, counted from (0, 0).
+
+    Returns:
+        x and y [m]; None without an intersection in front of the camera.
     """
     matrix = view.centred_at(pixel).matrix
     planar = matrix[:2, :2]

@@ -21,8 +21,8 @@ from taichi_msm.render.config import DrawingConfig
 from taichi_msm.render.cpu import Bands
 from taichi_msm.render.gpu import Threads
 from taichi_msm.render.labels import FrameOutputs, labels_of
-from taichi_msm.render.lens_table import undistortion_map
 from taichi_msm.render.shading import pyramid
+from taichi_msm.render.undistortion import undistortion_map
 from taichi_msm.scene.scene import Scene
 from taichi_msm.system.runtime import lanes
 
@@ -33,7 +33,7 @@ def drawing_config(
     """Return the compile-time configuration of kernel 2 for a scene.
 
     Args:
-        scene: the scene.
+        scene: scene with the settings of rendering.
         picture: whether colours are drawn.
         labels: names of the labels that are written; with a picture, they require one sample per pixel.
         lens: lens model of the camera, as `View.lens_model`; by default that of the scene's main camera.
@@ -61,7 +61,7 @@ class Rasterizer:
     """Rasteriser of the pictures and labels of a scene; call `runtime.start` first.
 
     Args:
-        scene: the scene.
+        scene: scene that is rendered.
         texture: texture of the sheet, shape (height, width, 3).
         config: compile-time configuration; by default that of the scene's pictures.
     """
@@ -77,19 +77,38 @@ class Rasterizer:
         backend = Threads if self.config.lanes == 1 else Bands
         self._backend: Bands | Threads = backend(self.config, scene.sheet.points, scene.render.size, texels)
 
-    def draw(self, position: NDArray[Any], camera: View | None = None, rods: Sequence[Solid] = ()) -> NDArray[np.uint8]:
-        """Draw the picture, shape (height, width, 3); arguments as for `look`."""
-        picture = self.look(position, camera, rods).picture
+    def draw(
+        self, position: NDArray[Any], camera: View | None = None, instruments: Sequence[Solid] = ()
+    ) -> NDArray[np.uint8]:
+        """Return the picture, shape (height, width, 3).
+
+        Args:
+            position: positions of the mass points [m], shape (rows, cols, 3).
+            camera: resolved camera; by default the scene's main camera at the start.
+            instruments: bodies of the tools in this frame.
+
+        Raises:
+            DeviceError: when the device ended a thread early.
+        """
+        picture = self.render(position, camera, instruments).picture
         assert picture is not None
         return picture
 
-    def look(self, position: NDArray[Any], camera: View | None = None, rods: Sequence[Solid] = ()) -> FrameOutputs:
+    def render(
+        self, position: NDArray[Any], camera: View | None = None, instruments: Sequence[Solid] = ()
+    ) -> FrameOutputs:
         """Draw the picture, the labels or both, as configured.
 
         Args:
             position: positions of the mass points [m], shape (rows, cols, 3).
-            camera: the camera; by default the scene's main camera at the start.
-            rods: the instruments.
+            camera: resolved camera; by default the scene's main camera at the start.
+            instruments: bodies of the tools in this frame.
+
+        Returns:
+            The picture and the labels; None for those that are not configured.
+
+        Raises:
+            DeviceError: when the device ended a thread early.
         """
         config, camera = self.config, camera or self._view
         if config.lens and camera.optics != self._optics:
@@ -97,8 +116,8 @@ class Rasterizer:
             self._backend.set_undistortion_map(
                 undistortion_map(camera, config.supersample, with_steps=config.map_has_steps)
             )
-        self._sizes[uni.INSTRUMENT_COUNT] = len(rods)
-        uniforms = uni.view_uniforms(camera, self.scene, rods, config.supersample, self._texture_size)
+        self._sizes[uni.INSTRUMENT_COUNT] = len(instruments)
+        uniforms = uni.view_uniforms(camera, self.scene, instruments, config.supersample, self._texture_size)
         picture, labels = self._backend.draw(
             np.ascontiguousarray(position, np.float32), uniforms.astype(np.float32), self._sizes
         )

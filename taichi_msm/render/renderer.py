@@ -33,18 +33,18 @@ class Shot(NamedTuple):
 
     positions: Array  # of the mass points [m], shape (rows, cols, 3)
     view: View
-    rods: Sequence[Solid] = ()  # the instruments
+    instruments: Sequence[Solid] = ()  # the instruments
 
 
 class Renderer:
     """Renderer of the pictures and labels of a scene; call `runtime.start` first.
 
     Args:
-        scene: the scene.
+        scene: scene that is rendered.
         texture: texture of the sheet, shape (height, width, 3); by default the picture that the scene names.
 
     Attributes:
-        scene: the scene; may be replaced by one that differs only in its probes.
+        scene: scene that is rendered; may be replaced by one that differs only in its probes.
         view: the scene's main camera at the start.
     """
 
@@ -63,7 +63,11 @@ class Renderer:
         self._views = {name: self.view if name == scene.render.main else view_at(scene, 0.0, name) for name in names}
 
     def resolve_camera(self, camera: CameraLike, time: float = 0.0) -> View:
-        """Resolve a camera at a time [s].
+        """Return the view of a camera.
+
+        Args:
+            camera: the camera, in any form of `CameraLike`.
+            time: time [s].
 
         Raises:
             ArgumentError: when no camera has this name.
@@ -97,7 +101,12 @@ class Renderer:
         return self._rasterizer(style, picture=True, camera=shot.view).draw(*shot)
 
     def is_compiled(self, style: Render, camera: View) -> bool:
-        """Return whether the kernel of `draw` is compiled already, for a style and a camera."""
+        """Return whether the kernel of `draw` is compiled already.
+
+        Args:
+            style: rendering settings, as for `draw`.
+            camera: resolved camera.
+        """
         return self._key(style, picture=True, camera=camera) in self._rasterizers
 
     def kernels(self) -> tuple[object, ...]:
@@ -120,6 +129,9 @@ class Renderer:
             before: labels of the first shot.
             shot: the second shot.
 
+        Returns:
+            Flow and occlusion of the pixels of the first shot.
+
         Raises:
             ArgumentError: when the labels do not fit the scene.
         """
@@ -127,7 +139,7 @@ class Renderer:
         points = as_array(before.coordinates, "before") if isinstance(before, Labels) else np.empty(0)
         on_sheet = points.dtype.kind == "f" and not ((points < 0) | (points > 1)).any()
         if points.shape != (height, width, 2) or not on_sheet:
-            raise ArgumentError(f"before: take what `labels` gave for a picture of {width} x {height} pixels")
+            raise ArgumentError(f"before: take the result of `labels` for a picture of {width} x {height} pixels")
         from taichi_msm.render.tracking import compute_flow
 
         return compute_flow(self.scene, points, *shot)
@@ -138,6 +150,9 @@ class Renderer:
         Args:
             coordinates: coordinates on the sheet, from 0 to 1, shape (n, 2).
             shot: sheet, camera and instruments.
+
+        Returns:
+            Pixels and occlusion of the points.
 
         Raises:
             ArgumentError: when the coordinates are invalid.
@@ -157,6 +172,9 @@ class Renderer:
         Args:
             before: labels of the previous frame, for the optical flow; None for the first frame.
             shot: sheet, camera and instruments.
+
+        Returns:
+            The outputs of the frame.
         """
         scene = self.scene
         # Labels require a sample at the centre of each pixel, which supersampling does not have.
@@ -165,7 +183,7 @@ class Renderer:
         observed = FrameOutputs()
         if scene.draws:
             labels = requested if scene.labels_pixels and is_single_sample else frozenset[str]()
-            observed = self._rasterizer(picture=True, labels=labels, camera=shot.view).look(*shot)
+            observed = self._rasterizer(picture=True, labels=labels, camera=shot.view).render(*shot)
         if scene.labels_pixels and observed.labels is None:
             observed = observed._replace(labels=self._labels(shot, requested))
         if observed.labels is not None and scene.asks_for("stereo") and shot.view.companion is not None:
@@ -190,7 +208,7 @@ class Renderer:
         return Stereo(disparity, *compute_stereo(self.scene, labels, *shot))
 
     def _labels(self, shot: Shot, names: Collection[str]) -> Labels:
-        labels = self._rasterizer(picture=False, labels=names, camera=shot.view).look(*shot).labels
+        labels = self._rasterizer(picture=False, labels=names, camera=shot.view).render(*shot).labels
         assert labels is not None
         return labels
 

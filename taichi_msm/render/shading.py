@@ -28,13 +28,13 @@ from taichi_msm.system.runtime import ti
 
 
 @ti.func
-def shade(entry, left, top, texels: ti.template(), band: ti.template()):
+def _shade(entry, left, top, texels: ti.template(), band: ti.template()):
     """Shade a tile: light the texture, then draw the mesh and the instruments; return the colour."""
     config, samples, uniforms = ti.static((band.config, band.samples, band.uniforms))
     plane = ti.static(config.plane)
     depth = samples[entry + plane.depth]
     is_covered = depth < INFINITY
-    colour, slope_x, slope_y = filter_texture(entry, is_covered, texels, band)
+    colour, slope_x, slope_y = _filter_texture(entry, is_covered, texels, band)
     if ti.static(config.headlit):
         for n in ti.static(range(3)):
             colour[n] *= samples[entry + plane.light]
@@ -42,7 +42,7 @@ def shade(entry, left, top, texels: ti.template(), band: ti.template()):
     normal = [samples[entry + (plane.normal_x + n)] for n in ti.static(range(3 * (config.tissue or config.metal)))]
     if ti.static(config.tissue):
         column, row = sample_centres(left, top, config)
-        share, gloss = light_tissue(x, y, depth, normal, slope_x, slope_y, column, row, band)
+        share, gloss = _light_tissue(x, y, depth, normal, slope_x, slope_y, column, row, band)
         for n in ti.static(range(3)):
             colour[n] = ti.min(colour[n] * share + gloss, 255.0)
     if ti.static(config.wireframe):
@@ -52,7 +52,7 @@ def shade(entry, left, top, texels: ti.template(), band: ti.template()):
     if ti.static(config.metal):
         is_metal = samples[entry + plane.instrument] > 0.0
         if ti.select(is_metal, 1.0, 0.0).max() > 0.0:
-            metal = light_metal(x, y, depth, normal, uniforms)
+            metal = _light_metal(x, y, depth, normal, uniforms)
             for n in ti.static(range(3)):
                 colour[n] = ti.select(is_metal, metal[n], colour[n])
     return [
@@ -61,7 +61,7 @@ def shade(entry, left, top, texels: ti.template(), band: ti.template()):
 
 
 @ti.func
-def write_colours(colour: ti.template(), row, end_row, tile, colours: ti.template(), band: ti.template()):
+def _write_colours(colour: ti.template(), row, end_row, tile, colours: ti.template(), band: ti.template()):
     """Write the colours of the tile in column `tile` of tiles, without supersampling."""
     packed = ti.floor(colour[0] + 0.5) + ti.floor(colour[1] + 0.5) * 256.0 + ti.floor(colour[2] + 0.5) * 65536.0
     width = ti.static(band.config.tile_width)
@@ -80,7 +80,7 @@ def write_colours(colour: ti.template(), row, end_row, tile, colours: ti.templat
 
 
 @ti.func
-def write_means(row, end_row, left, right, colours: ti.template(), band: ti.template()):
+def _write_means(row, end_row, left, right, colours: ti.template(), band: ti.template()):
     """Write the colours of the pixels in columns `left` to `right`, each the mean of its samples."""
     config = ti.static(band.config)
     factor, tile_width, tile_height = ti.static((config.supersample, config.tile_width, config.tile_height))
@@ -98,7 +98,7 @@ def write_means(row, end_row, left, right, colours: ti.template(), band: ti.temp
 
 
 @ti.func
-def write_labels(entry, left, row, end_row, labels: ti.template(), band: ti.template()):
+def _write_labels(entry, left, row, end_row, labels: ti.template(), band: ti.template()):
     """Write the labels of the pixels of a tile."""
     config, samples = ti.static((band.config, band.samples))
     plane, channels = ti.static((config.plane, label_channels(config.plane, config.labels)))
@@ -124,7 +124,18 @@ def write_labels(entry, left, row, end_row, labels: ti.template(), band: ti.temp
 def resolve(
     row, end_row, left, right, texels: ti.template(), colours: ti.template(), labels: ti.template(), band: ti.template()
 ):
-    """Shade the samples of the pixels in columns `left` to `right` of a band, and write the pixels."""
+    """Shade the samples of pixels in a band, and write the pixels' colours and labels.
+
+    Args:
+        row: first row [px].
+        end_row: row after the last one [px].
+        left: first column [px].
+        right: column after the last one [px].
+        texels: levels of the texture, as returned by `pyramid`.
+        colours: red, green and blue of all pixels, row by row, as words or bytes, written.
+        labels: all pixels of one label after the other, written.
+        band: the band, whose samples are covered.
+    """
     config = ti.static(band.config)
     factor, tile_width, tile_height = ti.static((config.supersample, config.tile_width, config.tile_height))
     lines = ((end_row - row) * factor + tile_height - 1) // tile_height
@@ -133,20 +144,20 @@ def resolve(
             entry = band.first + (tile_row * band.tiles_across + tile) * config.planes
             column, top = tile * tile_width, tile_row * tile_height
             if ti.static(len(config.labels) > 0):
-                write_labels(entry, column, row + top, end_row, labels, band)
+                _write_labels(entry, column, row + top, end_row, labels, band)
             if ti.static(config.picture):
-                colour = shade(entry, column, row * factor + top, texels, band)
+                colour = _shade(entry, column, row * factor + top, texels, band)
                 if ti.static(factor == 1):
-                    write_colours(colour, row + top, end_row, tile, colours, band)
+                    _write_colours(colour, row + top, end_row, tile, colours, band)
                 else:
                     for n in ti.static(range(3)):
                         band.samples[entry + config.plane.red + n] = colour[n]
     if ti.static(config.picture and factor > 1):
-        write_means(row, end_row, left, right, colours, band)
+        _write_means(row, end_row, left, right, colours, band)
 
 
 @ti.func
-def illuminate(x, y, depth, normal: ti.template(), uniforms: ti.template()):
+def _illuminate(x, y, depth, normal: ti.template(), uniforms: ti.template()):
     """Return N L; M V; d0 / d; and the upward component of the direction of ideal reflection of V."""
     offset_x, offset_y = line_of_sight(x, y, uniforms)
     w = w_at(depth, uniforms)
@@ -170,7 +181,7 @@ def illuminate(x, y, depth, normal: ti.template(), uniforms: ti.template()):
 
 
 @ti.func
-def specular(mirror):
+def _specular(mirror):
     """Return (M V)^shininess, given M V."""
     power = ti.max(ti.min(mirror, 1.0), 0.0)
     for _ in ti.static(range(uni.SHARPNESS)):
@@ -179,7 +190,7 @@ def specular(mirror):
 
 
 @ti.func
-def light_transmission(x, y, depth, band: ti.template()):
+def _light_transmission(x, y, depth, band: ti.template()):
     """Return the share of the light that is not shaded by the instruments."""
     uniforms = ti.static(band.uniforms)
     offset_x, offset_y = line_of_sight(x, y, uniforms)
@@ -198,7 +209,7 @@ def light_transmission(x, y, depth, band: ti.template()):
 
 
 @ti.func
-def apply_relief(normal: ti.template(), slope_x, slope_y, uniforms: ti.template()):
+def _apply_relief(normal: ti.template(), slope_x, slope_y, uniforms: ti.template()):
     """Tilt normals by the relief, in place, against the gradient of the grey level."""
     length = 1.0 / ti.max(ti.sqrt(dot(normal, normal)), 1e-30)
     a, b = triple(uniforms, uni.ACROSS), triple(uniforms, uni.UP)
@@ -210,7 +221,7 @@ def apply_relief(normal: ti.template(), slope_x, slope_y, uniforms: ti.template(
 
 
 @ti.func
-def light_tissue(x, y, depth, normal: ti.template(), slope_x, slope_y, column, row, band: ti.template()):
+def _light_tissue(x, y, depth, normal: ti.template(), slope_x, slope_y, column, row, band: ti.template()):
     """Return the factor of the colours of wet tissue, and the gloss that is added to them, 0 to 255.
 
     The samples are at `column` and `row` of the picture.
@@ -218,13 +229,13 @@ def light_tissue(x, y, depth, normal: ti.template(), slope_x, slope_y, column, r
     config, uniforms = ti.static((band.config, band.uniforms))
     tilted = [normal[n] for n in ti.static(range(3))]
     if ti.static(config.relief):
-        apply_relief(tilted, slope_x, slope_y, uniforms)
-    cosine, mirror, nearness, _ = illuminate(x, y, depth, tilted, uniforms)
+        _apply_relief(tilted, slope_x, slope_y, uniforms)
+    cosine, mirror, nearness, _ = _illuminate(x, y, depth, tilted, uniforms)
     diffuse = ti.max(cosine + uni.WRAP, 0.0) * (1.0 / (1.0 + uni.WRAP)) * nearness * uniforms[uni.LIGHT_NORMALISATION]
     factor = uniforms[uni.AMBIENT] + (1.0 - uniforms[uni.AMBIENT]) * diffuse
-    gloss = specular(mirror) * nearness * (255.0 * uniforms[uni.GLOSS])
+    gloss = _specular(mirror) * nearness * (255.0 * uniforms[uni.GLOSS])
     if ti.static(len(config.shapes) > 0):
-        transmission = light_transmission(x, y, depth, band)
+        transmission = _light_transmission(x, y, depth, band)
         factor, gloss = factor * transmission, gloss * transmission
     if ti.static(config.vignette):
         # The distance from the centre of the picture is in units of half its diagonal.
@@ -237,14 +248,14 @@ def light_tissue(x, y, depth, normal: ti.template(), slope_x, slope_y, column, r
 
 
 @ti.func
-def light_metal(x, y, depth, normal: ti.template(), uniforms: ti.template()):
+def _light_metal(x, y, depth, normal: ti.template(), uniforms: ti.template()):
     """Return the colour of metal, which reflects a room with a bright ceiling and a dark floor."""
     # Metal at or behind the light is lit as if it were in front of it.
     lit_depth = ti.max(depth, uni.METAL_NEAREST * uniforms[uni.LIGHT_DISTANCE])
-    cosine, mirror, _, upward = illuminate(x, y, lit_depth, normal, uniforms)
+    cosine, mirror, _, upward = _illuminate(x, y, lit_depth, normal, uniforms)
     brightness = ti.max(upward, 0.0)
     factor = uni.METAL_AMBIENT + uni.METAL_DIFFUSE * ti.max(cosine, 0.0) + uni.METAL_MIRROR * brightness * brightness
-    gloss = specular(mirror) * (255.0 * uni.METAL_GLOSS)
+    gloss = _specular(mirror) * (255.0 * uni.METAL_GLOSS)
     return [ti.min(factor * uni.METAL[n] + gloss, 255.0) for n in ti.static(range(3))]
 
 
@@ -274,13 +285,13 @@ def pyramid(texture: NDArray[np.uint8], *, minified: bool) -> tuple[NDArray[np.f
 
 
 @ti.func
-def to_integers(values, config: ti.template()):
+def _to_integers(values, config: ti.template()):
     """Convert to integers, lane by lane, because casting a vector crashes."""
     return config.integer_vector([ti.cast(values[lane], ti.i32) for lane in ti.static(range(config.lanes))])
 
 
 @ti.func
-def fetch_rgb(index, texels: ti.template(), config: ti.template()):
+def _fetch_rgb(index, texels: ti.template(), config: ti.template()):
     """Gather the texels at some indices; return their colours."""
     texel = config.float_vector([texels[index[lane]] for lane in ti.static(range(config.lanes))])
     blue = ti.floor(texel * (1.0 / 65536.0))
@@ -290,7 +301,7 @@ def fetch_rgb(index, texels: ti.template(), config: ti.template()):
 
 
 @ti.func
-def bilinear(upper_left, upper_right, lower_left, lower_right, u, v):
+def _bilinear(upper_left, upper_right, lower_left, lower_right, u, v):
     """Interpolate bilinearly, at fractions u to the right and v down."""
     upper = upper_left + (upper_right - upper_left) * u
     lower = lower_left + (lower_right - lower_left) * u
@@ -298,40 +309,36 @@ def bilinear(upper_left, upper_right, lower_left, lower_right, u, v):
 
 
 @ti.func
-def fetch(first, width, height, x, y, texels: ti.template(), config: ti.template()):
-    """Filter a level of the texture bilinearly.
+def _fetch(first, width, height, x, y, texels: ti.template(), config: ti.template()):
+    """Filter a level of the texture bilinearly: return its colour, and with a relief the gradient of the grey level.
 
-    Args:
-        first: first texel of the level.
-        width, height: size of the level [texels].
-        x, y: column and row in the level [texels].
-
-    Returns:
-        The colour; with a relief the gradient of the grey level, to the right and down [1/texel].
+    The level has `width` x `height` texels from `first` on; `x` and `y` are column and row in it. The gradient is to
+    the
+    right and down [1/texel].
     """
     # Beyond the centres of its outermost texels the texture is constant.
     texel_x = ti.max(ti.min(x, width - 1.0), 0.0)
     texel_y = ti.max(ti.min(y, height - 1.0), 0.0)
     floor_x, floor_y = ti.floor(texel_x), ti.floor(texel_y)
     u, v = texel_x - floor_x, texel_y - floor_y
-    left, row = to_integers(floor_x, config), to_integers(floor_y, config)
+    left, row = _to_integers(floor_x, config), _to_integers(floor_y, config)
     right = ti.min(left + 1, width - 1)
     upper = row * width + first
     lower = ti.min(row + 1, height - 1) * width + first
-    ul, ur = fetch_rgb(upper + left, texels, config), fetch_rgb(upper + right, texels, config)
-    ll, lr = fetch_rgb(lower + left, texels, config), fetch_rgb(lower + right, texels, config)
+    ul, ur = _fetch_rgb(upper + left, texels, config), _fetch_rgb(upper + right, texels, config)
+    ll, lr = _fetch_rgb(lower + left, texels, config), _fetch_rgb(lower + right, texels, config)
     slope_x, slope_y = u, v
     if ti.static(config.relief):
         grey_ul, grey_ur = ul[0] + ul[1] + ul[2], ur[0] + ur[1] + ur[2]
         grey_ll, grey_lr = ll[0] + ll[1] + ll[2], lr[0] + lr[1] + lr[2]
         slope_x = (grey_ur - grey_ul + (grey_lr - grey_ll - (grey_ur - grey_ul)) * v) * (1.0 / 3.0)
         slope_y = (grey_ll - grey_ul + (grey_lr - grey_ur - (grey_ll - grey_ul)) * u) * (1.0 / 3.0)
-    return [bilinear(ul[n], ur[n], ll[n], lr[n], u, v) for n in ti.static(range(3))], slope_x, slope_y
+    return [_bilinear(ul[n], ur[n], ll[n], lr[n], u, v) for n in ti.static(range(3))], slope_x, slope_y
 
 
 @ti.func
-def filter_texture(entry, is_covered, texels: ti.template(), band: ti.template()):
-    """Filter the texture, as `fetch`, for the samples of a tile that show a surface, the mask `is_covered`."""
+def _filter_texture(entry, is_covered, texels: ti.template(), band: ti.template()):
+    """Filter the texture, as `_fetch`, for the samples of a tile in the mask `is_covered`."""
     config, sizes, samples = ti.static((band.config, band.sizes, band.samples))
     float_vector, integer_vector, plane = ti.static((config.float_vector, config.integer_vector, config.plane))
     x = ti.select(is_covered, samples[entry + plane.texel_x], 0.0)
@@ -367,12 +374,12 @@ def filter_texture(entry, is_covered, texels: ti.template(), band: ti.template()
                 level += 1
             x = (x + 0.5) / texel_size - 0.5
             y = (y + 0.5) / texel_size - 0.5
-    colour, slope_x, slope_y = fetch(first, width, height, x, y, texels, config)
+    colour, slope_x, slope_y = _fetch(first, width, height, x, y, texels, config)
     if ti.static(config.tissue):  # noqa: SIM102  (evaluated at compile time)
         if max_footprint > 1.0:
             x = x * 0.5 - 0.25
             y = y * 0.5 - 0.25
-            coarse_colour, coarse_slope_x, coarse_slope_y = fetch(
+            coarse_colour, coarse_slope_x, coarse_slope_y = _fetch(
                 coarse_first, coarse_width, coarse_height, x, y, texels, config
             )
             coarse_weight = ti.max(ti.min(ti.sqrt(footprint) / texel_size - 1.0, 1.0), 0.0)

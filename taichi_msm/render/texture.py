@@ -19,8 +19,8 @@ def load_texture(scene: Scene, sha256: str | None = None) -> NDArray[np.uint8]:
     Only the first picture of a file is read. Transparent pixels are composited onto the scene's background.
 
     Args:
-        scene: the scene.
-        sha256: required SHA-256 of the file; any if None.
+        scene: scene with the name of the picture and its region.
+        sha256: required SHA-256 of the file, in hexadecimal; any if None.
 
     Returns:
         Colours, shape (height, width, 3).

@@ -21,7 +21,7 @@ from taichi_msm.render.config import INFINITY, Bytes, Doubles, Floats, Integers
 from taichi_msm.render.coverage import intersect_instrument
 from taichi_msm.render.geometry import NODE_STRIDE
 from taichi_msm.render.labels import NO_FLOW, Flow, Labels, Sight
-from taichi_msm.render.lens_table import undistorted_view
+from taichi_msm.render.undistortion import undistorted_view
 from taichi_msm.scene.scene import Scene
 from taichi_msm.system.launches import Launches, end_thread
 from taichi_msm.system.runtime import compilation_options, lanes, ti
@@ -42,75 +42,108 @@ CELLS_AROUND_NODE = 4
 NOT_VISIBLE = math.nan
 
 
-def locate_points(scene: Scene, coordinates: Array, position: Array, view: View, rods: Sequence[Solid] = ()) -> Sight:
-    """Project material points into the picture, and determine their occlusion.
+def locate_points(
+    scene: Scene, coordinates: Array, position: Array, view: View, instruments: Sequence[Solid] = ()
+) -> Sight:
+    """Project material points into a picture, and determine their occlusion.
 
     Args:
-        scene: the scene.
+        scene: scene with the sheet and the size of the picture.
         coordinates: coordinates of the points on the sheet, as in `Labels`, shape (n, 2).
         position: positions of the mass points [m], shape (rows, cols, 3).
-        view: the camera.
-        rods: the instruments.
+        view: camera of the picture.
+        instruments: bodies of the tools at this time, which occlude points.
+
+    Returns:
+        Pixels and occlusion of the points.
 
     Raises:
         DeviceError: when the device ended a thread early.
     """
-    pixels, hidden = _track(scene, coordinates, position, view, rods, as_flow=False)
+    pixels, hidden = _track(scene, coordinates, position, view, instruments, as_flow=False)
     return Sight(pixels, hidden.view(np.bool_))
 
 
-def compute_flow(scene: Scene, coordinates: Array, position: Array, view: View, rods: Sequence[Solid] = ()) -> Flow:
-    """Compute the optical flow and the occlusion of another frame's pixels.
+def compute_flow(
+    scene: Scene, coordinates: Array, position: Array, view: View, instruments: Sequence[Solid] = ()
+) -> Flow:
+    """Compute the optical flow from another frame to this one.
 
-    Arguments and errors as for `locate_points`, except that `coordinates` are those in the labels of the other frame,
-    shape (height, width, 2).
+    Args:
+        scene: scene with the sheet and the size of the picture.
+        coordinates: coordinates in the labels of the other frame, shape (height, width, 2).
+        position: positions of the mass points in this frame [m], shape (rows, cols, 3).
+        view: camera in this frame.
+        instruments: bodies of the tools in this frame, which occlude points.
+
+    Returns:
+        Flow and occlusion of the pixels of the other frame.
+
+    Raises:
+        DeviceError: when the device ended a thread early.
     """
     shape = coordinates.shape[:2]
-    moved, hidden = _track(scene, coordinates.reshape(-1, 2), position, view, rods, as_flow=True)
+    moved, hidden = _track(scene, coordinates.reshape(-1, 2), position, view, instruments, as_flow=True)
     return Flow(moved.reshape(*shape, 2), hidden.reshape(shape) * np.uint8(255))
 
 
-def compute_stereo(scene: Scene, labels: Labels, position: Array, view: View, rods: Sequence[Solid] = ()) -> Flow:
+def compute_stereo(
+    scene: Scene, labels: Labels, position: Array, view: View, instruments: Sequence[Solid] = ()
+) -> Flow:
     """Compute the flow from a camera's picture to that of its companion at the same time, also of instruments.
 
-    Arguments and errors as for `locate_points`, except for the labels of the camera's picture.
+    Args:
+        scene: scene with the sheet and the size of the picture.
+        labels: labels of the camera's picture.
+        position: positions of the mass points [m], shape (rows, cols, 3).
+        view: reference camera of the pair, with its companion.
+        instruments: bodies of the tools at this time, which occlude points.
+
+    Returns:
+        Flow and occlusion of the pixels of the camera's picture.
+
+    Raises:
+        DeviceError: when the device ended a thread early.
     """
     companion = view.companion
     assert companion is not None
-    flow, occlusion = compute_flow(scene, labels.coordinates, position, companion, rods)
+    flow, occlusion = compute_flow(scene, labels.coordinates, position, companion, instruments)
     shown = np.argwhere(labels.instrument)
     if len(shown):
         y, x = shown.T
         centres = shown[:, ::-1].astype(np.float64) + 0.5
         pixels = view.undistort(centres)
-        depth = _instrument_depth(scene, pixels, view, rods)
+        depth = _instrument_depth(scene, pixels, view, instruments)
         # Rounding to f32 may have drawn a pixel that is just outside the outline.
         depth = np.where(depth < INFINITY, depth, labels.depth[y, x])
-        there, hidden = _track(scene, view.points(pixels, depth), position, companion, rods, as_flow=False)
-        flow[y, x] = np.where(np.isnan(there), NO_FLOW, there - centres)
+        companion_pixels, hidden = _track(
+            scene, view.points(pixels, depth), position, companion, instruments, as_flow=False
+        )
+        flow[y, x] = np.where(np.isnan(companion_pixels), NO_FLOW, companion_pixels - centres)
         occlusion[y, x] = hidden * np.uint8(255)
     return Flow(flow, occlusion)
 
 
-def _instrument_depth(scene: Scene, pixels: Array, view: View, rods: Sequence[Solid]) -> Array:
+def _instrument_depth(scene: Scene, pixels: Array, view: View, instruments: Sequence[Solid]) -> Array:
     """Return the depth of the instruments at undistorted pixels, shape (n, 2) [m]; INFINITY next to them."""
     launches = Launches(bounded=lanes("f64") == 1)
-    uniforms = uni.view_uniforms(view._replace(lens=None), scene, rods)
+    uniforms = uni.view_uniforms(view._replace(lens=None), scene, instruments)
     depth = launches.array(np.float64, len(pixels))
     launches.launch(
         _ray_kernel(scene.shapes), len(pixels), launches.upload(np.ascontiguousarray(pixels).ravel()),
-        launches.upload(uniforms), len(rods), depth, rounds=len(rods),
+        launches.upload(uniforms), len(instruments), depth, rounds=len(instruments),
     )  # fmt: skip
     launches.require_completion()
     return launches.download(depth)
 
 
 def _track(
-    scene: Scene, points: Array, position: Array, view: View, rods: Sequence[Solid], *, as_flow: bool
+    scene: Scene, points: Array, position: Array, view: View, instruments: Sequence[Solid], *, as_flow: bool
 ) -> tuple[NDArray[np.float32], NDArray[np.uint8]]:
-    """Return the pixels of points, `as_flow` relative to another frame's pixels, and their occlusion.
+    """Return the pixels of points, or their flow, and their occlusion.
 
-    The points are coordinates of material points, shape (n, 2), or points of instruments [m], shape (n, 3).
+    The points are coordinates of material points, shape (n, 2), or points of instruments [m], shape (n, 3). The flow is
+    relative to the pixels of another frame, whose points these are.
     """
     total, is_material = len(points), points.shape[-1] == 2
     if total == 0:
@@ -124,12 +157,12 @@ def _track(
     # With bins half as wide as cells, most bins only overlap the cells around one mass point.
     bin_size = max(4, round((width * height / cells) ** 0.5 / 2))
     launches = Launches(bounded=lanes("f64") == 1)
-    uniform_values = uni.view_uniforms(undistorted, scene, rods)
+    uniform_values = uni.view_uniforms(undistorted, scene, instruments)
     if view.lens is not None:
         uni.set_lens(uniform_values, view, 1, view.lens.limit)
     uniforms = launches.upload(uniform_values)
     sizes = uni.sizes_of(scene, np.empty((0, 3), np.int32))
-    sizes[[uni.INSTRUMENT_COUNT, uni.WIDTH, uni.HEIGHT]] = len(rods), width, height
+    sizes[[uni.INSTRUMENT_COUNT, uni.WIDTH, uni.HEIGHT]] = len(instruments), width, height
     nodes, cell = (launches.array(np.float64, n) for n in (rows * cols * NODE_STRIDE, cells * CELL_STRIDE))
     bounds = launches.array(np.int32, cells * BOUNDS_STRIDE)
     with compilation_options(optimised=False):
@@ -153,7 +186,7 @@ def _track(
     rounds = 1 + 2 * (scene.render.refine + 1) ** 2
     for listed, count in launches.chunks(int(bins.lengths.max()), rounds):
         kernel = _kernel(view.lens_model, scene.shapes, is_material)
-        launches.launch(kernel, total, listed, count, *arguments, rounds=count * rounds + len(rods))
+        launches.launch(kernel, total, listed, count, *arguments, rounds=count * rounds + len(instruments))
     launches.require_completion()
     return launches.download(pixels).reshape(-1, 2), launches.download(hidden)
 
@@ -231,15 +264,15 @@ def _quad_depth(x, y, quad_column, quad_row, quad_side, lower, near, patch: ti.t
 
 @ti.func
 def _cell_occludes(
-    x, y, depth, index, own_cell, own_triangle, cols, subdivisions, near, nodes: ti.template(), cell: ti.template()
+    x, y, depth, index, point_cell, point_triangle, cols, subdivisions, near, nodes: ti.template(), cell: ti.template()
 ):
-    """Return whether a cell occludes a point at (x, y) and `depth` on the triangle `own_triangle` of `own_cell`."""
+    """Return whether a cell occludes a point at (x, y) and `depth` on the triangle `point_triangle` of `point_cell`."""
     entry, quad_side = index * CELL_STRIDE, 1.0 / subdivisions
     facing = cell[entry + CELL_FACING]
     invertible = facing != 0.0
     occluded = False
     # An invertible cell has at most one point on a line of sight.
-    possible = cell[entry + CELL_MIN_DEPTH] < depth and not (index == own_cell and invertible)
+    possible = cell[entry + CELL_MIN_DEPTH] < depth and not (index == point_cell and invertible)
     if (
         possible
         and x >= cell[entry + CELL_MIN_X]
@@ -258,7 +291,7 @@ def _cell_occludes(
         else:
             per_side = ti.cast(subdivisions, ti.i32)
             for triangle in range(2 * per_side * per_side):
-                if not occluded and not (index == own_cell and triangle == own_triangle):
+                if not occluded and not (index == point_cell and triangle == point_triangle):
                     quad = triangle // 2
                     column, row = ti.cast(quad % per_side, ti.f64), ti.cast(quad // per_side, ti.f64)
                     occluded = _quad_depth(x, y, column, row, quad_side, triangle % 2 == 1, near, patch) < depth
@@ -273,7 +306,17 @@ def _ray_kernel(shapes: tuple[str, ...]) -> Callable[..., None]:
     def meet_instruments(
         first: ti.i32, end: ti.i32, ended: Integers, pixels: Doubles, uniforms: Doubles, count: ti.i32, depth: Doubles
     ):
-        """Compute the depth of the nearest of `count` instruments at undistorted pixels."""
+        """Compute the depth of the nearest instrument on lines of sight.
+
+        Args:
+            first: first line of sight of the launch.
+            end: line of sight after the last one.
+            ended: counter of finished threads, for `end_thread`.
+            pixels: undistorted x and y of each line of sight [px], shape (2 * n,).
+            uniforms: constants of the view, as returned by `view_uniforms`.
+            count: number of instruments.
+            depth: depth [m], INFINITY without an intersection, written; shape (n,).
+        """
         for k in range(first, end):
             nearest = ti.cast(INFINITY, ti.f64)
             for index in range(count):
@@ -322,8 +365,8 @@ def _material_point(entry, points: ti.template(), sizes: ti.template(), subdivis
 
 
 @ti.func
-def _other_point(entry, points: ti.template(), _sizes: ti.template(), _subdivisions, _nodes: ti.template()):
-    """Return X, Y, w and depth of a point that is not on the sheet; no cell is its own."""
+def _instrument_point(entry, points: ti.template(), _sizes: ti.template(), _subdivisions, _nodes: ti.template()):
+    """Return X, Y, w and depth of a point that is not on the sheet, with -1 as its cell and its triangle."""
     return points[entry], points[entry + 1], points[entry + 2], points[entry + 3], -1, -1
 
 
@@ -331,7 +374,7 @@ def _other_point(entry, points: ti.template(), _sizes: ti.template(), _subdivisi
 def _kernel(lens: str, shapes: tuple[str, ...], is_material: bool) -> Callable[..., None]:
     """Return the kernel that locates material points of the sheet, or points of instruments."""
     Points: Any = Floats if is_material else Doubles
-    locate, stride, limit = (_material_point, 2, 2.0) if is_material else (_other_point, 4, INFINITY)
+    locate, stride, limit = (_material_point, 2, 2.0) if is_material else (_instrument_point, 4, INFINITY)
 
     @ti.kernel
     def locate_kernel(
@@ -342,23 +385,32 @@ def _kernel(lens: str, shapes: tuple[str, ...], is_material: bool) -> Callable[.
         """Project points, and test their occlusion by a chunk of the cells in their bins.
 
         Args:
+            first: first point of the launch.
+            end: point after the last one.
+            ended: counter of finished threads, for `end_thread`.
             listed: position of the first cell in its list.
             count: number of cells.
-            points: coordinates of material points on the sheet, or X, Y, w and depth of other points.
+            points: coordinates of material points on the sheet, shape (2 * n,); of instruments X, Y, w and depth of
+                points, shape (4 * n,).
             as_flow: 0 for pixels; 1 for displacements from the pixel centres of another frame, whose points these are.
-            cell: outlines of the cells.
+            uniforms: constants of the view without distortion, and the lens.
+            sizes: sizes and counters, as returned by `sizes_of`.
+            nodes: projected mass points, NODE_STRIDE numbers each.
+            cell: outlines of the cells, CELL_STRIDE numbers each.
             starts: start of the list of each bin.
             entries: cells of all lists.
             is_simple: whether no two cells of a bin overlap.
-            pixels: pixels or displacements [px], written.
-            hidden: whether the points are hidden, updated.
+            pixels: pixels or displacements [px], shape (2 * n,), written.
+            hidden: whether the points are hidden, shape (n,), updated.
         """
         for k in range(first, end):
             cols, width, height = sizes[uni.COLS], sizes[uni.WIDTH], sizes[uni.HEIGHT]
             near, subdivisions = uniforms[uni.NEAR], uniforms[uni.SUBDIVISIONS]
             x, y, is_hidden = ti.cast(NOT_VISIBLE, ti.f64), ti.cast(NOT_VISIBLE, ti.f64), False
             if abs(points[stride * k]) < limit:  # False for NaN
-                p_x, p_y, w, p_depth, own_cell, own_triangle = locate(stride * k, points, sizes, subdivisions, nodes)
+                p_x, p_y, w, p_depth, point_cell, point_triangle = locate(
+                    stride * k, points, sizes, subdivisions, nodes
+                )
                 is_hidden = True
                 if w > near:
                     x, y = p_x / w, p_y / w
@@ -375,7 +427,7 @@ def _kernel(lens: str, shapes: tuple[str, ...], is_material: bool) -> Callable[.
                             for n in range(begin, ti.min(begin + count, starts[bin_index + 1])):
                                 if not is_hidden:
                                     is_hidden = _cell_occludes(
-                                        undistorted_x, undistorted_y, depth, entries[n], own_cell, own_triangle,
+                                        undistorted_x, undistorted_y, depth, entries[n], point_cell, point_triangle,
                                         cols, subdivisions, near, nodes, cell,
                                     )  # fmt: skip
                         if ti.static(len(shapes) > 0):

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from taichi_msm.model.surface import Solid
 from taichi_msm.render.camera import View
-from taichi_msm.render.lens_table import visible_region
+from taichi_msm.render.undistortion import visible_region
 from taichi_msm.scene.scene import Scene
 from taichi_msm.shapes import SHAPES
 
@@ -24,7 +24,7 @@ WIRE_WIDTH = 1.0
 WIRE_OPACITY = 0.75
 
 # Maximum size of a tissue sample on the texture that is filtered at full resolution [texels]: the filter has two.
-SHARP = 2.0
+FULL_RESOLUTION_TEXELS = 2.0
 
 # Offset of the light from the eye, to the right and up, as a fraction of the distance to the target.
 LIGHT_RIGHT, LIGHT_UP = -0.3, 0.0
@@ -61,7 +61,7 @@ MATRIX, AXES, NEAR, SUBDIVISIONS, BACKGROUND = 0, 16, 25, 26, 27
 CENTRE_X, CENTRE_Y, SPREAD_X, SPREAD_Y, PINHOLE, MIDDLE_X, MIDDLE_Y = range(30, 37)
 
 # The light's position to the right and up, in the camera's frame [m]; its distance from the target of the main camera
-# [m]; the factor that normalises the light to 1 there; the scene's light settings.
+# [m]; the factor that normalises the light to 1 at the target; the scene's light settings.
 LIGHT_X, LIGHT_Y, LIGHT_DISTANCE, LIGHT_NORMALISATION, AMBIENT, GLOSS, VIGNETTE = range(37, 44)
 
 # The sheet's axes to the right and up, in the camera's frame; the slope of the relief per grey level between
@@ -75,7 +75,7 @@ SCREEN = 4
 DEPTH_TOLERANCE = 52
 
 # The lens: its coefficients; its radius at w = 1 [m]; the principal point [samples]; samples per metre at w = 1; the
-# numbers of `lens_table.VisibleRegion`, in samples.
+# numbers of `undistortion.VisibleRegion`, in samples.
 LENS, LENS_RADIUS, PICTURE_X, PICTURE_Y, FOCAL_X, FOCAL_Y, VISIBLE = 53, *range(61, 67)
 SAGITTA_FACTOR, STRETCH_FACTOR = 70, 71
 
@@ -90,7 +90,12 @@ KINDS = {name: float(number) for number, name in enumerate(SHAPES)}
 
 
 def sizes_of(scene: Scene, levels: NDArray[np.int32]) -> NDArray[np.int32]:
-    """Build the array of sizes, for levels from `pyramid`; those that change from frame to frame are 0."""
+    """Return the array of sizes and counters of a scene; those that change from frame to frame are 0.
+
+    Args:
+        scene: scene with the points of the sheet and the size of the picture.
+        levels: start, width and height of the levels of the texture, as returned by `pyramid`, shape (levels, 3).
+    """
     sizes = np.zeros(LEVELS + levels.size, np.int32)
     sizes[[ROWS, COLS, WIDTH, HEIGHT, LEVEL_COUNT]] = *scene.sheet.points, *scene.render.size, len(levels)
     sizes[LEVELS:] = levels.flat
@@ -98,19 +103,19 @@ def sizes_of(scene: Scene, levels: NDArray[np.int32]) -> NDArray[np.int32]:
 
 
 def view_uniforms(
-    view: View, scene: Scene, rods: Sequence[Solid], factor: int = 1, texture: tuple[int, int] = (1, 1)
+    view: View, scene: Scene, instruments: Sequence[Solid], factor: int = 1, texture: tuple[int, int] = (1, 1)
 ) -> Array:
-    """Build the array of uniforms of a view.
+    """Return the array of uniforms of a view.
 
     Args:
-        view: the camera.
-        scene: has the rendering settings and the size of the sheet.
-        rods: the instruments.
+        view: resolved camera.
+        scene: scene with the rendering settings and the size of the sheet.
+        instruments: bodies of the tools in this frame.
         factor: samples per pixel along each axis.
         texture: width and height of the texture [texels].
     """
     render, sheet = scene.render, scene.sheet.size
-    uniforms = np.zeros(INSTRUMENTS + len(rods) * INSTRUMENT_STRIDE)
+    uniforms = np.zeros(INSTRUMENTS + len(instruments) * INSTRUMENT_STRIDE)
     uniforms[MATRIX:AXES] = (view.matrix * np.array([[factor], [factor], [1], [1]])).ravel()
     uniforms[AXES:NEAR] = view.axes.ravel()
     uniforms[NEAR:BACKGROUND] = view.near, render.refine + 1
@@ -134,15 +139,22 @@ def view_uniforms(
         set_lens(uniforms, view, factor, region.radius)
         uniforms[VISIBLE:SAGITTA_FACTOR] = np.array(region.box) * factor
         uniforms[SAGITTA_FACTOR], uniforms[STRETCH_FACTOR] = region.sagitta_factor / factor, region.stretch_factor
-    for n, rod in enumerate(rods):
+    for n, instrument in enumerate(instruments):
         uniforms[INSTRUMENTS + n * INSTRUMENT_STRIDE : INSTRUMENTS + (n + 1) * INSTRUMENT_STRIDE] = (
-            _instrument_uniforms(rod, view, factor)
+            _instrument_uniforms(instrument, view, factor)
         )
     return uniforms
 
 
 def set_lens(uniforms: Array, view: View, factor: int, radius: float) -> None:
-    """Set the uniforms of a lens; `radius` is its limit, or the largest visible radius, at w = 1 [m]."""
+    """Set the uniforms of a lens.
+
+    Args:
+        uniforms: uniforms of the view, updated.
+        view: camera with lens distortion.
+        factor: samples per pixel along each axis.
+        radius: limit of the lens, or the largest visible radius, at w = 1 [m].
+    """
     assert view.lens is not None
     uniforms[LENS : LENS + len(view.lens.coefficients)] = view.lens.coefficients
     uniforms[LENS_RADIUS] = radius

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from taichi_msm.accuracy.companions import QUASISTATIC_REASON, CompanionRuns, choose_companion_runs
 from taichi_msm.accuracy.path_dependence import PathDependence
-from taichi_msm.accuracy.report import RunErrorEstimates, RunErrorEstimator, run_warnings
+from taichi_msm.accuracy.run_errors import RunErrorEstimates, RunErrorEstimator, run_warnings
 from taichi_msm.errors import (
     DamagedError,
     DeviceError,
@@ -423,7 +423,7 @@ class _Run:
             "probes": probes,
             "notes": notes,
             "error_estimate": _error_record(estimates),
-            **({"error_estimate_reason": estimates.reason} if estimates.estimate is None else {}),
+            **({"error_estimate_reason": estimates.reason} if estimates.time_step is None else {}),
         }
 
     def _pause(self) -> None:
@@ -492,7 +492,7 @@ def _pixels_per_metre(scene: Scene) -> float | None:
 
 def _error_record(estimates: RunErrorEstimates) -> dict[str, Any] | None:
     """Build the error estimate for run.json; unknown values are null."""
-    estimate, mesh, keys = estimates.estimate, estimates.mesh, ("error", "rounding", "in_f64", "order", "at_least")
+    estimate, mesh, keys = estimates.time_step, estimates.mesh, ("error", "rounding", "in_f64", "order", "at_least")
     if estimate is not None:
         fields: dict[str, Any] = {key: getattr(estimate, key) for key in keys}
     elif mesh is not None and estimates.reason == QUASISTATIC_REASON:

@@ -58,24 +58,21 @@ class Capsule(Shape):
         return intersect
 
     def profile(self, length: float, radius: float) -> Array:
-        """Return two quarters of a circle, of 8 segments each; see `Shape.profile`."""
+        # Two quarters of a circle, of 8 segments each.
         latitude = np.linspace(np.pi / 2, 0, 9)
         latitude, offset = np.concatenate([latitude, -latitude[::-1]]), np.repeat([length, 0.0], len(latitude))
         normals = np.stack([np.sin(latitude), np.cos(latitude)])
         return np.stack([offset + radius * normals[0], radius * normals[1], *normals], axis=1)
 
     def tip_height(self, axis: Array, radius: float) -> float:
-        """Return the radius."""
         return radius
 
     def gap(self, tip: Array, axis: Array, length: float, radius: float, half: Array) -> float:
-        """Return the distance of the axis from a rectangle, less the radius; see `Shape.gap`."""
-
         def distance(s: float) -> float:
             point = tip + s * axis
             return float(np.linalg.norm(point - np.clip(point, -half, half)))
 
-        # Ternary search, because the distance is a convex function of s.
+        # Ternary search, because the distance of the axis from the rectangle is a convex function of s.
         low, high = 0.0, length
         for _ in range(200):
             left, right = low + (high - low) / 3, high - (high - low) / 3

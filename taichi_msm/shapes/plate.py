@@ -11,9 +11,6 @@ import numpy as np
 from taichi_msm.arithmetic import NUMPY, Operations
 from taichi_msm.shapes.shape import MIN_DISTANCE_M, Array, Shape
 
-# Points inside are pushed out of an end unless the side is so many times nearer: those near the rim stay under it.
-RIM = 8.0
-
 # A ray that is more nearly parallel to a plane or to the axis does not intersect it.
 MIN_COSINE = 1e-12
 
@@ -34,7 +31,8 @@ class Plate(Shape):
             distance = sqrt(r_x * r_x + r_y * r_y + r_z * r_z)
             divisor = maximum(distance, MIN_DISTANCE_M)
             outside_side, outside_end = distance - radius, maximum(s * (-1.0), s - length)
-            is_side = outside_side * RIM > outside_end
+            # A point inside leaves through an end unless the side is 8 times nearer; points near the rim stay under it.
+            is_side = outside_side * 8.0 > outside_end
             sign = where(s < length * 0.5, -1.0, 1.0)
             return (
                 where(is_side, outside_side, outside_end) * (-1.0),
@@ -69,16 +67,16 @@ class Plate(Shape):
         return intersect
 
     def profile(self, length: float, radius: float) -> Array:
-        """Return the end, the side and the end at the tip; see `Shape.profile`."""
+        # The far end, the side and the end at the tip.
         ends = [[length, 0, 1, 0], [length, radius, 1, 0], [length, radius, 0, 1]]
         return np.array([*ends, [0, radius, 0, 1], [0, radius, -1, 0], [0, 0, -1, 0]], float)
 
     def tip_height(self, axis: Array, radius: float) -> float:
-        """Return the height of the centre of the end above its rim's lowest point; 0 where the axis is vertical."""
+        # The height of the centre of the end above its rim's lowest point; 0 where the axis is vertical.
         return radius * math.hypot(*axis[:2])
 
     def gap(self, tip: Array, axis: Array, length: float, radius: float, half: Array) -> float:
-        """Return the distance by alternating projection, or the largest depth of a grid of points; see `Shape.gap`."""
+        # Inside, the largest depth on a grid of points; outside, the distance by alternating projection.
         grid = np.stack(np.meshgrid(*np.linspace(-half[:2], half[:2], 401).T, [0.0]), axis=-1).reshape(-1, 3) - tip
         if (deepest := float(self.build_depth(NUMPY)(*grid.T, *axis, length, radius)[0].max())) > 0:
             return -deepest

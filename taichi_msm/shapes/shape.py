@@ -1,4 +1,4 @@
-"""Interface of the shape of a tool, and what NumPy and kernels share of it.
+"""Interface of the shape of a tool, shared by NumPy and kernels.
 
 A shape is convex and has an axis, from its tip c along the unit vector a: it lies within `radius` of the points c + s a
 with 0 <= s <= length. Its formulas are plain arithmetic: NumPy calls them as they are, kernels call them wrapped by
@@ -31,39 +31,48 @@ class Shape(ABC):
 
     @abstractmethod
     def build_depth(self, operations: Operations) -> Callable[..., Any]:
-        """Build depth(x, y, z, a_x, a_y, a_z, length, radius) for points relative to the tip.
+        """Build the function depth(x, y, z, a_x, a_y, a_z, length, radius) of points relative to the tip [m].
 
-        It returns the depth inside the shape, negative outside, and the unit normal at the nearest point of its
-        surface, outward, in three components.
+        It returns the depth inside the shape [m], negative outside, and the outward unit normal at the nearest point of
+        its surface, in three components.
         """
 
     @abstractmethod
     def build_ray(self, operations: Operations) -> Callable[..., Any]:
-        """Build intersect(d_d, d_a, o_a, o_d, o_o, length, radius) for lines o + t d, relative to the tip.
+        """Build the function intersect(d_d, d_a, o_a, o_d, o_o, length, radius) of lines o + t d relative to the tip.
 
-        d_d is d . d, and so on. It returns t where the line enters the shape, whether it does, and numbers `foot` and
-        `end`: the outward normal there is `end` a, if that is not 0, and otherwise o + t d - `foot` a.
+        d_d is the product d . d, and so on. It returns t where the line enters the shape, whether it does, and numbers
+        `foot` and `end`: the outward normal there is `end` a, if that is not 0, and otherwise o + t d - `foot` a.
         """
 
     @abstractmethod
     def profile(self, length: float, radius: float) -> Array:
-        """Return the outline that meshes revolve about the axis, from its end to the tip, shape (points, 4).
+        """Return the outline that meshes revolve about the axis, from the far end to the tip, shape (points, 4).
 
-        Of each point, its place along the axis and its distance from it [m], and the same components of its normal.
+        The columns are the position along the axis and the distance from it [m], and the same components of the normal.
+
+        Args:
+            length: length of the axis [m].
+            radius: radius of the shape [m].
         """
 
     @abstractmethod
     def tip_height(self, axis: Array, radius: float) -> float:
-        """Return the height of the tip above the lowest point of the end of the shape [m]."""
+        """Return the height of the tip above the lowest point of the end of the shape [m].
+
+        Args:
+            axis: unit vector from the tip along the shaft, shape (3,).
+            radius: radius of the shape [m].
+        """
 
     @abstractmethod
     def gap(self, tip: Array, axis: Array, length: float, radius: float, half: Array) -> float:
         """Return the distance of the shape from a flat rectangle around the origin [m], negative where it is inside.
 
         Args:
-            tip: the tip [m], shape (3,).
-            axis: unit vector from the tip along the shape, shape (3,).
-            length: of the axis [m].
-            radius: of the shape [m].
+            tip: position of the tip [m], shape (3,).
+            axis: unit vector from the tip along the shaft, shape (3,).
+            length: length of the axis [m].
+            radius: radius of the shape [m].
             half: half the sides of the rectangle, and 0 [m], shape (3,).
         """

@@ -5,12 +5,10 @@ from typing import Any
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 from scipy.integrate import quad
 
 from taichi_msm.model.loads import LoadBounds, average_loads, evaluate_loads
-from taichi_msm.model.plan import probe_slots
-from taichi_msm.scene.scene import Scene
+from taichi_msm.model.plan import Plan, probe_slots
 from tests.scenes import PRESS, SPRINGS, plan_of, scene
 
 # 25 frames a second in 4 steps of 0.01 s.
@@ -18,41 +16,32 @@ STEPS = {"duration": 1.0, "step": 0.01}
 SOFT = {**SPRINGS, "structural": 0.1, "shear": 0.1, "virtual": 0.1}
 
 
+def plan_with(*probes: dict[str, Any], springs: dict[str, Any] = SOFT) -> Plan:
+    """A scene in steps of 0.01 s, with probes of 100 N along x and 8 N along z by default."""
+    return plan_of(scene(springs=springs, probes=[{"force": [100, 0, 8], **probe} for probe in probes], time=STEPS))
+
+
 @pytest.mark.parametrize(
     ("load", "expected"),
     [
         # A ramp of 25 a step counts with a third of that at t = 0, and a kink with a sixth less or more.
         ([[0, 0], [0.04, 100]], [25 / 3, 25, 50, 75, 100 - 25 / 6, 100]),
-        ([[0, 100]], [100, 100, 100, 100, 100, 100]),
+        ([[0, -80], [0.04, 80]], [-80 + 40 / 3, -40, 0, 40, 80 - 20 / 3, 80]),
         # A jump on a step counts with the mean of its limits; half-way between two steps with 1/8 and 7/8,
+        ([[0, 0], [0, 100]], [100, 100, 100, 100, 100, 100]),
         ([[0.02, 100]], [0, 0, 50, 100, 100, 100]),
         ([[0.025, 100]], [0, 0, 12.5, 87.5, 100, 100]),
         # and so does the end of a ramp: 5/8 of its value before the jump at the top.
         ([[0, 0], [0.02, 100], [0.02, 0]], [50 / 3, 50, 50 - 25 / 3, 0, 0, 0]),
-        ([[0, 0], [0, 100]], [100, 100, 100, 100, 100, 100]),
-        ([[0, -80], [0.04, 80]], [-80 + 40 / 3, -40, 0, 40, 80 - 20 / 3, 80]),
-        # Keys 1 ns apart are a jump.
+        # Keyframes 1 ns apart are a jump.
         ([[0, 0], [0.02, 0], [0.020000001, 100]], [0, 0, 49.99999, 99.99999, 100, 100]),
-        # A blow of a tenth of a step, at a step and half-way between two.
+        # A pulse of a tenth of a step, at a step and half-way between two.
         ([[0.0195, 0], [0.0195, 100], [0.0205, 100], [0.0205, 0]], [0, 0.125, 9.75, 0.125, 0, 0]),
         ([[0.0245, 0], [0.0245, 100], [0.0255, 100], [0.0255, 0]], [0, 0, 5, 5, 0, 0]),
     ],
 )
-def test_percent(load: list[list[float]], expected: list[float]) -> None:
-    made = scene(springs=SOFT, probes=[{"force": [100, 0, 0], "load": load}], time=STEPS)
-    assert average_loads(plan_of(made), 0, 6).strength[:, 0, 0] == pytest.approx(expected, abs=1.1e-5)
-
-
-def test_what_no_key_is_near_is_the_value_itself() -> None:
-    load = [[0, 0], [0.1, 33.3], [0.3, 33.3], [0.7, 80], [2, 81]]
-    made = scene(springs=SOFT, probes=[{"force": [100, 0, 0], "load": load}], time=STEPS)
-    found = average_loads(plan_of(made), 0, 100).strength[:, 0, 0]
-    t = np.arange(100) / 100
-    expected = np.interp(t, *np.array(load).T)
-    near = np.isin(np.arange(100), [0, 10, 30, 70])
-    np.testing.assert_allclose(found[~near], expected[~near], rtol=1e-15)
-    assert (found[11:30] == 33.3).all()
-    assert (np.abs(found[near] - expected[near]) > 1e-3).all()
+def test_average_of_a_load(load: list[list[float]], expected: list[float]) -> None:
+    assert average_loads(plan_with({"load": load}), 0, 6).strength[:, 0, 0] == pytest.approx(expected, abs=1.1e-5)
 
 
 def random_load(seed: int) -> list[list[float]]:
@@ -65,11 +54,11 @@ def random_load(seed: int) -> list[list[float]]:
 
 @pytest.mark.default_cases("2")
 @pytest.mark.parametrize("seed", range(4))
-def test_the_average_is_the_integral_with_the_hat(seed: int) -> None:
+def test_average_is_the_integral_with_the_hat(seed: int) -> None:
     load = random_load(seed)
     at = [[0, 0, 0], [0.011, 1, 0], [0.011, 0, 1], [0.043, 0.5, 0.5], [0.043, 0.25, 0]]
-    made = scene(springs=SOFT, probes=[{"force": [100, 0, 0], "load": load, "at": at}], time=STEPS)
-    found, h = average_loads(plan_of(made), 0, 7), plan_of(made).grid.step
+    plan = plan_with({"load": load, "at": at})
+    averages, h = average_loads(plan, 0, 7), plan.grid.step
     keys = sorted({time for time, _ in load} | {0.011, 0.043})
 
     def integral(of: Any, n: int) -> float:
@@ -84,39 +73,37 @@ def test_the_average_is_the_integral_with_the_hat(seed: int) -> None:
     def of_slot(slot: int, t: float) -> float:
         """The two slots act by turns: the first until the first jump, and from the second one on."""
         acts = ((t >= 0.011) + (t >= 0.043)) % 2 == slot
-        return float(evaluate_loads(plan_of(made), np.array([t])).strength[0, 0, 0]) if acts else 0.0
+        return float(evaluate_loads(plan, np.array([t])).strength[0, 0, 0]) if acts else 0.0
 
     for n in range(7):
         for slot in range(2):
             strength = integral(lambda t, slot=slot: of_slot(slot, t), n)
-            assert found.strength[n, slot, 0] == pytest.approx(strength, abs=1e-9), (n, slot)
-        active = integral(lambda t: evaluate_loads(plan_of(made), np.array([t])).active[0], n)
-        assert found.active[n] == pytest.approx(active, abs=1e-9), n
+            assert averages.strength[n, slot, 0] == pytest.approx(strength, abs=1e-9), (n, slot)
+        active = integral(lambda t: evaluate_loads(plan, np.array([t])).active[0], n)
+        assert averages.active[n] == pytest.approx(active, abs=1e-9), n
 
 
-def test_a_free_point_goes_where_the_load_takes_it() -> None:
-    """Verlet's u_{n+1} = 2 u_n - u_{n-1} + h^2 a_n is then exact, whatever the load."""
+def test_averaged_load_displaces_a_free_point_exactly() -> None:
+    """Verlet's u_{n+1} = 2 u_n - u_{n-1} + h^2 a_n equals the double integral of a, for any load."""
     load = random_load(5)
-    made = scene(springs={}, probes=[{"force": [1, 0, 0], "load": load}], time=STEPS)
-    a, h = average_loads(plan_of(made), 0, 8).strength[:, 0, 0], plan_of(made).grid.step
+    plan = plan_with({"force": [1, 0, 0], "load": load}, springs={})
+    a, h = average_loads(plan, 0, 8).strength[:, 0, 0], plan.grid.step
     u = [0.0, h**2 / 2 * a[0]]
     for n in range(1, 8):
         u.append(2 * u[-1] - u[-2] + h**2 * a[n])
     keys = sorted(time for time, _ in load if 0 < time < 8 * h)
 
     def double_integral(end: float) -> float:
+        def integrand(t: float) -> float:
+            return (end - t) * float(evaluate_loads(plan, np.array([t])).strength[0, 0, 0])
+
         cuts = [0.0, *(time for time in keys if time < end), end]
-        return sum(
-            quad(
-                lambda t: (end - t) * evaluate_loads(plan_of(made), np.array([t])).strength[0, 0, 0], a, b, epsabs=1e-14
-            )[0]
-            for a, b in pairwise(cuts)
-        )
+        return sum(quad(integrand, a, b, epsabs=1e-14)[0] for a, b in pairwise(cuts))
 
     np.testing.assert_allclose(u, [double_integral(n * h) for n in range(9)], atol=1e-12)
 
 
-def test_a_step_meets_a_key_in_spite_of_rounding() -> None:
+def test_step_meets_a_keyframe_in_spite_of_rounding() -> None:
     # Three steps of a frame of 10 s: the third ends at 3 / (3 x 0.1) s, which rounds to less than 10 s.
     made = scene(
         springs={},
@@ -124,8 +111,8 @@ def test_a_step_meets_a_key_in_spite_of_rounding() -> None:
         time={"duration": 20, "frames_per_second": 0.1, "step": 10 / 3},
     )
     assert 3 / (3 * 0.1) < 10
-    found = average_loads(plan_of(made), 0, 6)
-    np.testing.assert_allclose(found.strength[:, 0, 0], [0, 0, 0, 50, 100, 100], atol=1e-12)
+    strength = average_loads(plan_of(made), 0, 6).strength[:, 0, 0]
+    np.testing.assert_allclose(strength, [0, 0, 0, 50, 100, 100], atol=1e-12)
 
 
 @pytest.mark.parametrize(
@@ -143,94 +130,84 @@ def test_a_step_meets_a_key_in_spite_of_rounding() -> None:
         ([[[0, 0]]], [0, 0, 0, 0, 0, 0]),
     ],
 )
-def test_virtual_springs_while_loaded(loads: list[list[list[float]]], expected: list[float]) -> None:
-    probes = [{"force": [0, 0, 1], "load": load} for load in loads]
-    made = scene(springs=SOFT, probes=probes, time=STEPS)
-    assert average_loads(plan_of(made), 0, 6).active.tolist() == pytest.approx(expected, abs=1e-12)
-    made = scene(springs={**SOFT, "virtual_active": "always"}, probes=probes, time=STEPS)
-    assert average_loads(plan_of(made), 0, 6).active.tolist() == [1] * 6
+def test_activity_of_virtual_springs(loads: list[list[list[float]]], expected: list[float]) -> None:
+    probes = [{"load": load} for load in loads]
+    assert average_loads(plan_with(*probes), 0, 6).active.tolist() == pytest.approx(expected, abs=1e-12)
+    always = plan_with(*probes, springs={**SOFT, "virtual_active": "always"})
+    assert average_loads(always, 0, 6).active.tolist() == [1] * 6
 
 
-def test_a_schedule_does_not_depend_on_where_it_is_cut() -> None:
-    made = scene(springs=SOFT, time=STEPS)
-    whole = average_loads(plan_of(made), 0, 40)
+def test_schedule_does_not_depend_on_its_blocks() -> None:
+    plan = plan_with(PRESS)
+    expected = average_loads(plan, 0, 40)
     for cut in (1, 17, 20, 21):
-        halves = average_loads(plan_of(made), 0, cut), average_loads(plan_of(made), cut, 40 - cut)
+        halves = average_loads(plan, 0, cut), average_loads(plan, cut, 40 - cut)
         for n in range(1, 4):
-            np.testing.assert_array_equal(np.concatenate([half[n] for half in halves]), whole[n])
+            np.testing.assert_array_equal(np.concatenate([half[n] for half in halves]), expected[n])
 
 
-def test_keys_that_change_nothing_change_no_bit() -> None:
-    """As those that a session leaves out of its record, and those that are not known yet when a step is taken."""
+def test_redundant_and_later_keyframes_change_no_bit() -> None:
+    """As those that a session omits from its record, and those that are unknown when a step is executed."""
 
     def bits(load: list[list[float]], steps: int) -> bytes:
-        made = scene(springs=SOFT, probes=[{"force": [0, 0, 8], "load": load}], time=STEPS)
-        return b"".join(part.tobytes() for part in average_loads(plan_of(made), 0, steps)[1:])
+        return b"".join(part.tobytes() for part in average_loads(plan_with({"load": load}), 0, steps)[1:])
 
     load: list[list[float]] = [[0, 0], [0.013, 70], [0.031, 70]]
     assert bits(load, 9) == bits([*load[:2], [0.017, 70], [0.02, 70], *load[2:], [0.05, 70], [0.06, 70]], 9)
-    # What begins at step 6 is not seen by step 5.
+    # A load that begins at step 6 does not affect step 5.
     assert bits(load, 6) == bits([*load, [0.06, 70], [0.06, 0], [0.08, 5]], 6)
 
 
-@pytest.mark.parametrize("keys", [[[0, 0, 0], [0.02, 0, 0], [0.02, 1, 1]], [[0.02, 0, 0], [0.02, 1, 1]]])
-def test_a_jump_of_the_control_point_shares_the_force_between_both_places(keys: list[list[float]]) -> None:
-    probe = {"force": [0, 0, 8], "at": keys, "load": [[0, 100], [0.02, 100], [0.02, 50]]}
-    made = scene(springs=SOFT, probes=[probe], time=STEPS)
-    found = average_loads(plan_of(made), 0, 5)
-    assert [(slot.turn, slot.turns, slot.moves) for slot in found.slots] == [(0, 2, True), (1, 2, True)]
-    np.testing.assert_allclose(found.strength[..., 2].T, [[8, 8, 4, 0, 0], [0, 0, 2, 4, 4]], atol=1e-12)
-    np.testing.assert_allclose(found.point[2], [[-0.2, 0.15], [0.2, -0.15]])
-    np.testing.assert_allclose(found.point[:2, 0], [[-0.2, 0.15]] * 2)
-    np.testing.assert_allclose(found.point[3:, 1], [[0.2, -0.15]] * 2)
+@pytest.mark.parametrize("at", [[[0, 0, 0], [0.02, 0, 0], [0.02, 1, 1]], [[0.02, 0, 0], [0.02, 1, 1]]])
+def test_jump_of_a_control_point_shares_the_force(at: list[list[float]]) -> None:
+    loads = average_loads(plan_with({"at": at, "load": [[0, 100], [0.02, 100], [0.02, 50]]}), 0, 5)
+    assert [(slot.turn, slot.turns, slot.moves) for slot in loads.slots] == [(0, 2, True), (1, 2, True)]
+    np.testing.assert_allclose(loads.strength[..., 2].T, [[8, 8, 4, 0, 0], [0, 0, 2, 4, 4]], atol=1e-12)
+    np.testing.assert_allclose(loads.point[2], [[-0.2, 0.15], [0.2, -0.15]])
+    np.testing.assert_allclose(loads.point[:2, 0], [[-0.2, 0.15]] * 2)
+    np.testing.assert_allclose(loads.point[3:, 1], [[0.2, -0.15]] * 2)
 
 
-def test_a_control_point_is_where_its_keys_have_it() -> None:
-    def places(at: list[list[float]]) -> NDArray[np.float64]:
-        made = scene(springs=SOFT, probes=[{"force": [0, 0, 8], "at": at}], time=STEPS)
-        return average_loads(plan_of(made), 0, 6).point
-
-    # Between its keys, and held before and after. The sheet is 0.4 m wide and 0.3 m high, its centre the origin, y up.
+def test_control_point_between_keyframes() -> None:
+    # Constant before and after its keyframes. The sheet is 0.4 m wide and 0.3 m high, its centre the origin, y up.
+    point = average_loads(plan_with({"at": [[0.01, 0, 0], [0.03, 1, 0.5]]}), 0, 6).point
     expected = [[-0.2, 0.15], [-0.2, 0.15], [0, 0.075], [0.2, 0], [0.2, 0], [0.2, 0]]
-    np.testing.assert_allclose(places([[0.01, 0, 0], [0.03, 1, 0.5]])[:, 0], expected, atol=1e-15)
-    # A jump between two steps; before it the control point moves, and after it too.
-    x = places([[0, 0, 0], [0.024, 0.6, 0], [0.024, 1, 1], [0.044, 0.5, 1]])[..., 0] / 0.4 + 0.5
+    np.testing.assert_allclose(point[:, 0], expected, atol=1e-15)
+    # A jump between two steps, with movement before and after it.
+    at = [[0, 0, 0], [0.024, 0.6, 0], [0.024, 1, 1], [0.044, 0.5, 1]]
+    x = average_loads(plan_with({"at": at}), 0, 6).point[..., 0] / 0.4 + 0.5
     np.testing.assert_allclose(x[[0, 1, 2, 3], 0], [0, 0.25, 0.5, 0.6], atol=1e-12)
     np.testing.assert_allclose(x[[2, 3, 4], 1], [1, 0.85, 0.6], atol=1e-12)
 
 
-def test_a_control_point_that_jumps_a_thousand_times_has_few_places() -> None:
-    """However many jumps, a step has no more forces to add up than it sees jumps."""
+def test_slots_of_a_control_point_with_1000_jumps() -> None:
+    """A step adds up one force more than the number of jumps within its hat."""
     at = [[n / 100, *place] for n in range(1000) for place in ([n % 7 / 7, 0.5], [n % 5 / 5, 0.25])]
     probes = [{"force": [0, 0, 8], "at": at}, PRESS]
     made = scene(springs=SOFT, probes=probes, time={"duration": 10.0, "step": 0.005})
-    between = average_loads(plan_of(made), 2, 1)
-    found = [(slot.probe, slot.turn, slot.turns, slot.moves) for slot in between.slots]
-    assert found == [(0, 0, 2, True), (0, 1, 2, True), (1, 0, 1, False)]
-    assert len(probe_slots(made.probes, made.sheet, 0.01)) == 1 + 3, "steps of 0.01 s see two jumps"
-    loads = evaluate_loads(plan_of(made), np.array([0.0104, 0.0204]))
-    assert [(slot.probe, slot.turns) for slot in loads.slots] == [(0, 1), (1, 1)], "at one time it is at one place"
-    np.testing.assert_allclose(loads.strength[:, 0, 2], [8, 8])
-    across = [n / 5 + 0.04 * ((n + 1) / 7 - n / 5) for n in (1, 2)]
-    np.testing.assert_allclose(loads.point[:, 0, 0], (np.array(across) - 0.5) * 0.4)
-    np.testing.assert_allclose(sum(between.strength[0, :2, 2]), 8, rtol=1e-12)
+    averages = average_loads(plan_of(made), 2, 1)
+    slots = [(slot.probe, slot.turn, slot.turns, slot.moves) for slot in averages.slots]
+    assert slots == [(0, 0, 2, True), (0, 1, 2, True), (1, 0, 1, False)]
+    np.testing.assert_allclose(sum(averages.strength[0, :2, 2]), 8, rtol=1e-12)
+    assert len(probe_slots(made.probes, made.sheet, 0.01)) == 1 + 3, "two jumps within a hat of 0.01 s"
+    # Without averaging, a probe has one slot.
+    assert [slot.turns for slot in evaluate_loads(plan_of(made), np.array([0.0104])).slots] == [1, 1]
 
 
-def within(made: Scene, begin: float, end: float) -> tuple[float, bool, int]:
-    forces, active, begins = LoadBounds(plan_of(made)).between(begin, end)
-    return round(float(forces.max()), 12), active, begins
-
-
-def test_the_envelope_holds_what_steps_see() -> None:
+def test_bounds_of_loads() -> None:
     load = [[0.1, 50], [0.2, -100], [0.2, 0], [0.5, 0], [0.5, 20], [0.6, 0]]
-    made = scene(springs=SOFT, probes=[{"force": [0, 3, 4], "load": load}], time=STEPS)
-    assert within(made, 0, 0.08) == (0.0, False, 0)
-    assert within(made, 0, 0.1) == (5 * 0.5, True, 1)
-    assert within(made, 0.15, 0.18) == (5 * 0.85, True, 0)
-    assert within(made, 0.15, 0.19) == (5, True, 0), "the step at 0.19 s sees as far as 0.2 s"
-    assert within(made, 0.3, 0.4) == (0.0, False, 0)
-    assert within(made, 0.3, 0.55) == (5 * 0.2, True, 1)
-    found = average_loads(plan_of(made), 0, 100)
+    plan = plan_with({"force": [0, 3, 4], "load": load})
+
+    def bounds(begin: float, end: float) -> tuple[float, bool, int]:
+        forces, active, activations = LoadBounds(plan).between(begin, end)
+        return round(float(forces.max()), 12), active, activations
+
+    assert bounds(0, 0.08) == (0.0, False, 0)
+    assert bounds(0, 0.1) == (5 * 0.5, True, 1)
+    assert bounds(0.15, 0.18) == (5 * 0.85, True, 0)
+    assert bounds(0.15, 0.19) == (5, True, 0), "the hat of the step at 0.19 s extends to 0.2 s"
+    assert bounds(0.3, 0.4) == (0.0, False, 0)
+    assert bounds(0.3, 0.55) == (5 * 0.2, True, 1)
+    strength = np.linalg.norm(average_loads(plan, 0, 100).strength[:, 0], axis=-1)
     for first in range(0, 96, 4):
-        most = np.linalg.norm(found.strength[first : first + 5, 0], axis=-1).max()
-        assert most <= within(made, first / 100, (first + 4) / 100)[0] * (1 + 1e-12)
+        assert strength[first : first + 5].max() <= bounds(first / 100, (first + 4) / 100)[0] * (1 + 1e-12)

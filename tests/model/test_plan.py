@@ -1,4 +1,4 @@
-"""A scene is resolved once, into a plan that everything after takes."""
+"""A scene is resolved once, into a plan that all other parts use."""
 
 from __future__ import annotations
 
@@ -19,10 +19,9 @@ from taichi_msm.model import plan, sheet
 from taichi_msm.solver import planning
 from taichi_msm.solver.planning import make_plan, plan_variant
 
-# Gives a scene a map.
 MAP = "tissue.map={image: textures/tumour.png, range: [1, 13]}"
 
-DERIVED = [
+RESOLVING = [
     (terms, "derive_material"),
     (terms, "highest_frequency"),
     (plan, "probe_slots"),
@@ -36,39 +35,35 @@ DERIVED = [
 
 @pytest.fixture
 def calls(monkeypatch: pytest.MonkeyPatch) -> Counter[str]:
-    """How many times each of these functions is called, wherever it was imported."""
+    """Number of calls of each of these functions, in every module that imports it."""
     counted: Counter[str] = Counter()
 
     def count(name: str, function: Callable[..., Any], *arguments: Any) -> Any:
         counted[name] += 1
         return function(*arguments)
 
-    for module, name in DERIVED:
+    for module, name in RESOLVING:
         function: Callable[..., Any] = getattr(module, name)
-        for other in [one for key, one in sys.modules.items() if key.startswith(taichi_msm.__name__)]:
-            if getattr(other, name, None) is function:
-                monkeypatch.setattr(other, name, partial(count, name, function))
+        for importer in [each for key, each in sys.modules.items() if key.startswith(taichi_msm.__name__)]:
+            if getattr(importer, name, None) is function:
+                monkeypatch.setattr(importer, name, partial(count, name, function))
     return counted
 
 
-def test_a_run_and_a_check_derive_everything_once(root: Path, tmp_path: Path, calls: Counter[str]) -> None:
-    short = ["--set", "time.duration=0.08", "--set", "output=[trajectory]", "--no-estimate", "--quiet"]
-    scene = [str(root / "scenes/press.yaml"), "--set", MAP]
-    for command in (["check", *scene], ["run", *scene, "--out", str(tmp_path / "out"), *short]):
+def test_scene_is_resolved_once(root: Path, tmp_path: Path, calls: Counter[str]) -> None:
+    made = [str(root / "scenes/press.yaml"), "--set", MAP]
+    short = [*made, "--set", "time.duration=0.08", "--set", "output=[]", "--quiet", "--out"]
+    for command in (["check", *made], ["run", *short, str(tmp_path / "plain"), "--no-estimate"]):
         assert main(command) == 0
-        assert calls == dict.fromkeys((name for _, name in DERIVED), 1)
+        assert calls == dict.fromkeys((name for _, name in RESOLVING), 1)
         calls.clear()
-
-
-def test_pilots_with_fewer_points_derive_their_own_sheets_once(root: Path, tmp_path: Path, calls: Counter[str]) -> None:
-    short = ["--set", "time.duration=0.08", "--set", "output=[]", "--estimate-error", "--quiet"]
-    assert main(["run", str(root / "scenes/press.yaml"), "--set", MAP, "--out", str(tmp_path / "out"), *short]) == 0
-    # The run, the two companions, and the finer sheet that is advised.
+    # With a mesh estimate: the run, the two companion runs, and the finer mesh of the remedy.
+    assert main(["run", *short, str(tmp_path / "estimated"), "--estimate-error"]) == 0
     assert {calls[name] for name in ("derive_material", "fixed_points", "map_factors", "stable_step")} == {4}
-    assert calls["read_map"] == 1, "the map's file"
+    assert calls["read_map"] == 1
 
 
-def test_a_scene_without_the_map_of_another_one_has_none(root: Path) -> None:
+def test_variant_of_a_plan_without_its_map(root: Path) -> None:
     mapped = make_plan(load_scene(root / "scenes/press.yaml", [MAP]))
     assert mapped.scene.tissue is not None
     tissue = mapped.scene.tissue.model_copy(update={"map": None})

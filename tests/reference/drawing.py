@@ -84,7 +84,7 @@ class GBuffer(NamedTuple):
     u: Array
     v: Array
     wire: Array  # share of the mesh lines in the colour
-    footprint: Array  # larger of a sample's width and height on the texture, in units of uniforms.SHARP texels
+    footprint: Array  # larger side of a sample on the texture, in units of uniforms.FULL_RESOLUTION_TEXELS
     front: Array  # 1 where the front of the triangle is visible, else -1
     facet: Array  # normal of the triangle's front in the world [m^2], shape (height, width, 3); NaN in the background
 
@@ -159,7 +159,7 @@ def triangles(surface: Array) -> Iterator[Array]:
 
 
 def _footprint(triangle: Array, at: Samples, texels: tuple[int, int]) -> Array:
-    """Return the larger of a sample's width and height on the texture, in units of uniforms.SHARP texels.
+    """Return the larger side of a sample on the texture, in units of uniforms.FULL_RESOLUTION_TEXELS.
 
     By finite differences over a thousandth of a sample.
     """
@@ -171,7 +171,7 @@ def _footprint(triangle: Array, at: Samples, texels: tuple[int, int]) -> Array:
 
     right = texel(*at(step, 0)) - texel(*at(-step, 0))
     down = texel(*at(0, step)) - texel(*at(0, -step))
-    return np.asarray(np.maximum(np.hypot(*right), np.hypot(*down)) / (2 * step * uniforms.SHARP))
+    return np.asarray(np.maximum(np.hypot(*right), np.hypot(*down)) / (2 * step * uniforms.FULL_RESOLUTION_TEXELS))
 
 
 def draw(

@@ -87,7 +87,7 @@ def minified(texture: NDArray[np.uint8], u: Array, v: Array, footprint: Array) -
         texture: colours, shape (height, width, 3).
         u: fraction of the width, as for `sample`.
         v: fraction of the height.
-        footprint: larger of a sample's width and height, in units of uniforms.SHARP texels, same shape.
+        footprint: larger of a sample's width and height, in units of uniforms.FULL_RESOLUTION_TEXELS, same shape.
 
     Returns:
         Colours, shape (*u.shape, 3), and the gradient of the grey to the right and down [grey / texel], shape

@@ -1,4 +1,4 @@
-"""Shapes of tools: rays meet the surface of the depth, and a plate resists and is drawn by its area."""
+"""Shapes of tools: intersections of rays, and the resistance and the picture of a plate."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ K, SIDE, POINTS, RADIUS = 4e5, 0.1, 41, 0.0205
 
 
 @pytest.mark.parametrize("name", SHAPES)
-def test_a_ray_ends_where_it_enters(name: str) -> None:
+def test_ray_meets_the_surface_of_the_depth(name: str) -> None:
     rng = np.random.default_rng(1)
     axis = np.array([0.6, -0.48, 0.64])
     numbers = *axis, 0.3, 0.1
@@ -38,8 +38,8 @@ def test_a_ray_ends_where_it_enters(name: str) -> None:
     assert (is_hit != inside.any(axis=0)).mean() < 0.01
     hits = is_hit & inside.any(axis=0)
     points = origin + t[:, None] * direction
-    found, *outward = depth(*points.T, *numbers)
-    np.testing.assert_allclose(found[hits], 0, atol=1e-9)
+    depth_at_hit, *outward = depth(*points.T, *numbers)
+    np.testing.assert_allclose(depth_at_hit[hits], 0, atol=1e-9)
     first = along[inside.argmax(axis=0), 0]
     assert ((first - t)[hits] >= -1e-9).all()
     assert ((first - t)[hits] <= 1e-3 + 1e-9).mean() > 0.98
@@ -48,7 +48,7 @@ def test_a_ray_ends_where_it_enters(name: str) -> None:
     assert np.linalg.norm(normal.T - outward, axis=0)[hits].max() < 1e-6
 
 
-def pressed_by_a_plate(**changes: object) -> Scene:
+def plate_scene() -> Scene:
     rod = {"plate": RADIUS, "shaft": [0, 0, 1], "length": 0.05}
     return Scene(
         sheet={"points": [POINTS, POINTS], "size": [SIDE, SIDE]},
@@ -57,26 +57,26 @@ def pressed_by_a_plate(**changes: object) -> Scene:
         time={"motion": "quasistatic", "frames_per_second": 1, "duration": 1},
         render={"size": [100, 100], "supersample": 1},
         output=[],
-        **changes,
     )
 
 
-def test_a_plate_resists_by_its_area(device: Device) -> None:
+def test_plate_force_and_picture(device: Device) -> None:
+    # The foundation K under the mass points within the radius: F = K A w.
     cell = SIDE / (POINTS - 1)
     points = sum(math.hypot(i, j) * cell < RADIUS for i in range(-20, 21) for j in range(-20, 21))
     assert points * cell**2 == pytest.approx(math.pi * RADIUS**2, rel=0.02)
-    with Simulation(pressed_by_a_plate(), threads=device.threads) as simulation:
+    with Simulation(plate_scene(), threads=device.threads) as simulation:
         simulation.advance()
-        (felt,) = simulation.forces()
-        np.testing.assert_allclose(felt.force, [0, 0, -K * points * cell**2 * 4e-4], rtol=1e-6, atol=1e-9)
-        shown = simulation.labels().instrument
+        (on_tool,) = simulation.forces()
+        np.testing.assert_allclose(on_tool.force, [0, 0, -K * points * cell**2 * 4e-4], rtol=1e-6, atol=1e-9)
+        coverage = simulation.labels().instrument
         assert simulation.progress.pierced_by == 0
     pixels = np.hypot(*np.meshgrid(*2 * [(np.arange(100) - 49.5) * SIDE / 100]))
-    np.testing.assert_array_equal(shown == 255, pixels < RADIUS)
+    np.testing.assert_array_equal(coverage == 255, pixels < RADIUS)
 
 
-def test_a_plate_in_the_sheet_is_refused(message: Messages) -> None:
-    made = pressed_by_a_plate().model_dump(mode="json")
+def test_invalid_plates_are_rejected(message: Messages) -> None:
+    made = plate_scene().model_dump(mode="json")
     made["probes"][0]["path"][0][3] = -1e-3
     with message.raises(SceneError, "probes.0.path"):
         check_scene(made)

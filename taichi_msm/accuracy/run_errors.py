@@ -29,7 +29,7 @@ from taichi_msm.errors import Pause, ProgressCallback
 from taichi_msm.model import tool_force
 from taichi_msm.model.plan import Plan
 from taichi_msm.model.tool_force import ProbeRecord
-from taichi_msm.model.tools import COARSE_TIP_PHRASE, MAX_REFINEMENT, Clamp, path_warnings
+from taichi_msm.model.tools import COARSE_TIP_PHRASE, MAX_POINTS_RATIO, Clamp, path_warnings
 from taichi_msm.scene.section import MAX_POINTS
 from taichi_msm.scene.sheet import Foundation
 from taichi_msm.solver.dynamics import Dynamics
@@ -47,11 +47,8 @@ FORCE_ERROR_FACTOR = 1.15
 MIN_MESH_ERROR_SHARE = 0.5
 
 # Smallest length of a spring, relative to its rest length, for which the stability limit holds (see
-# `SpringTerm.stiffness_bound`), and largest length that tissue withstands.
-MIN_SPRING_RATIO, MAX_SPRING_RATIO = 0.5, 2.0
-
-# Tissue that is compressed by more than this share of its depth stiffens, unlike the elastic foundation.
-MAX_DEPTH_RATIO = 1 / 3
+# `SpringTerm.stiffness_bound`).
+MIN_SPRING_RATIO = 0.5
 
 # A remedy is suggested for an error above this share of the largest displacement.
 REMEDY_THRESHOLD = 0.01
@@ -61,14 +58,14 @@ class ForceEstimate(NamedTuple):
     """Estimated error of the forces of position-controlled tools."""
 
     error: float | None  # largest of any tool at any frame, as a fraction of the greatest force; None if unknown
-    doubt: str = ""  # why the error is unknown
+    doubt: str = ""  # reason for an unknown error
 
 
 class RunErrorEstimates(NamedTuple):
     """Estimated errors of a run."""
 
-    estimate: TimeStepEstimate | None = None  # error of the time step and of rounding; None if not estimated
-    reason: str = ""  # why it was not estimated
+    time_step: TimeStepEstimate | None = None  # error of the time step and of rounding; None if not estimated
+    reason: str = ""  # reason for the missing estimate
     mesh: MeshEstimate | None = None  # discretisation error of the mesh; None if not estimated
     force: ForceEstimate | None = None  # error of the forces of position-controlled tools; None without such tools
 
@@ -77,14 +74,14 @@ class RunErrorEstimator:
     """Companion runs of a run, and the errors that they estimate.
 
     Args:
-        plan: Plan of the run.
-        companions: Companion runs of the run.
-        known: Estimates from before the run, which are not repeated.
-        device: Device to run on.
-        cores: Number of CPU cores for stepping.
+        plan: plan of the run.
+        companions: companion runs of the run.
+        known: estimates from before the run, which are not repeated.
+        device: device to run on.
+        cores: number of CPU cores for stepping.
 
     Raises:
-        DeviceError: When the device cannot run the scene in f64.
+        DeviceError: when the device cannot run the scene in f64.
     """
 
     def __init__(
@@ -93,8 +90,8 @@ class RunErrorEstimator:
         self._plan, self._companions, self._known = plan, companions, known
         self._device, self._cores = device, cores
         steps = companions.concurrent_steps
-        self._coarse = known.estimate is None and 0 < steps < plan.grid.steps_per_frame
-        estimates_step = known.estimate is None and not companions.reason
+        self._coarse = known.time_step is None and 0 < steps < plan.grid.steps_per_frame
+        estimates_step = known.time_step is None and not companions.reason
         self._time_step = TimeStepCompanion(plan, steps, device, cores) if estimates_step else None
         coarse = mesh_companion_plan(plan) if companions.mesh and known.mesh is None else None
         # The meshes are compared with the coarse time-step companion if there is one, except in contact.
@@ -116,9 +113,9 @@ class RunErrorEstimator:
         """Step to the next frame and compare it.
 
         Args:
-            displacement: Displacements of the run at that frame [m], shape (rows, cols, 3).
-            pause: Called several times a second; after an exception from it the companion runs cannot continue.
-            forces: Mean forces of the position-controlled tools since the previous frame [N], shape (tools, 3); None if
+            displacement: displacements of the run at that frame [m], shape (rows, cols, 3).
+            pause: called several times a second; after an exception from it the companion runs cannot continue.
+            forces: mean forces of the position-controlled tools since the previous frame [N], shape (tools, 3); None if
                 unknown.
         """
         if self._time_step is not None:
@@ -141,9 +138,9 @@ class RunErrorEstimator:
         """After the last frame, run further companion runs if the first ones show an error that is not negligible.
 
         Args:
-            displacements: Displacements of the run at all frames but the first [m], each of shape (rows, cols, 3); None
+            displacements: displacements of the run at all frames but the first [m], each of shape (rows, cols, 3); None
                 to repeat the run.
-            progress: Called with the number of finished frames and their total.
+            progress: called with the number of finished frames and their total.
         """
         first = self._time_step
         fine_steps, fine, second_mesh = self._companions.subsequent_steps, None, None
@@ -159,7 +156,7 @@ class RunErrorEstimator:
             for companion in companions:
                 companion.compare_frame(displacement, partial(progress, frame, frames))
         if first is not None and fine is not None:
-            self._known = self._known._replace(estimate=combine_estimates(first.estimate, fine.estimate))
+            self._known = self._known._replace(time_step=combine_estimates(first.estimate, fine.estimate))
 
     def _repeated(self) -> Iterator[NDArray[Any]]:
         """Repeat the run and yield the displacements of its frames."""
@@ -172,18 +169,18 @@ class RunErrorEstimator:
     def estimates(self) -> RunErrorEstimates:
         """Estimates from the frames so far."""
         known = self._known
-        if known.estimate is None and self._time_step is not None:
+        if known.time_step is None and self._time_step is not None:
             estimate = self._time_step.estimate
             # For a run in f32 the estimate of a coarse companion run is an upper bound already.
             if self._coarse and estimate.parted and NEGLIGIBLE_ERROR <= estimate.error < math.inf:
                 estimate = replace(estimate, at_least=True)
-            known = known._replace(estimate=estimate)
+            known = known._replace(time_step=estimate)
         if self._mesh is not None:
             known = known._replace(mesh=self._mesh.estimate)
             meets = self._max_force[[not isinstance(tool, Clamp) for tool in self._plan.tools]].all()
             if self._all_forces and not meets:
                 known = known._replace(mesh=MeshEstimate(math.inf, NO_CONTACT))
-            elif self._plan.has_contact and known.estimate is not None and known.estimate.error > MAX_DIFFERENCE:
+            elif self._plan.has_contact and known.time_step is not None and known.time_step.error > MAX_DIFFERENCE:
                 known = known._replace(mesh=MeshEstimate(math.inf, LARGE_STEP_ERROR))
         return known._replace(force=self._force_estimate(known)) if self._plan.tools else known
 
@@ -204,7 +201,7 @@ class RunErrorEstimator:
         relative = max(relative, MIN_MESH_ERROR_SHARE * mesh.error)
         if not self._plan.has_contact:
             return ForceEstimate(relative)
-        displacement_error = max(mesh.error, known.estimate.error if known.estimate is not None else 0.0)
+        displacement_error = max(mesh.error, known.time_step.error if known.time_step is not None else 0.0)
         return ForceEstimate(min(relative, displacement_error))
 
 
@@ -216,18 +213,18 @@ def run_warnings(
     affords: Callable[[Plan], bool] = lambda plan: True,
     scale: float | None = None,
 ) -> Iterator[str]:
-    """List the error estimates and warnings of a run up to its last frame.
+    """Format the error estimates and warnings of a run up to its last frame.
 
     Args:
-        plan: Plan of the run.
-        probes: Records of the probes' forces.
-        progress: Progress of the run.
-        errors: Estimated errors of the run.
-        affords: Function that returns whether a plan can be run within an hour.
-        scale: Pixels per metre at the middle of the sheet; None without a picture.
+        plan: plan of the run.
+        probes: records of the probes' forces.
+        progress: progress of the run.
+        errors: estimated errors of the run.
+        affords: function that returns whether a plan can be run within an hour.
+        scale: pixels per metre at the middle of the sheet; None without a picture.
 
-    Returns:
-        Lines of text.
+    Yields:
+        A line of text per estimate or warning.
     """
     scene, grid = plan.scene, plan.grid
     estimate, reason, mesh, force = errors
@@ -240,7 +237,7 @@ def run_warnings(
             of = "the time step" if not estimate.parted or estimate.in_f64 > REMEDY_THRESHOLD / 2 else "rounding"
             yield f"for a smaller error of {of}, {_step_remedy(plan, estimate, affords)}"
     elif reason == QUASISTATIC_REASON:
-        yield "error: none due to a time step, as the sheet is at rest"
+        yield "error: no time step in a quasi-static scene"
     elif reason:
         yield f"error {'of the time step ' if mesh is not None else ''}not estimated: {reason}"
     if force is not None:
@@ -254,25 +251,21 @@ def run_warnings(
     yield from tool_contact_warnings(plan, progress)
     yield from energy_growth_warnings(plan, progress)
     if mesh is not None and mesh.doubt and mesh.error < math.inf:
-        yield f"the error due to the number of points may be larger: {mesh.doubt}"
+        yield f"the mesh error may be larger: {mesh.doubt}"
     # The warning about a mesh that is too coarse for a tool already contains the remedy.
     too_coarse_for_tool = any(COARSE_TIP_PHRASE in warning for warning in tool_warnings)
     if mesh is not None and REMEDY_THRESHOLD < mesh.error < math.inf and not too_coarse_for_tool:
         yield f"for a smaller error of the mesh, {_mesh_remedy(plan, mesh, affords)}"
     if progress.max_displacement == 0 and progress.frame > 0:
-        yield "nothing moved: does a probe press where and when it should?"
+        yield "nothing moved: check at, load or path of the probes"
     foundation = scene.tissue.foundation if scene.tissue is not None else None
-    if (
-        isinstance(foundation, Foundation)
-        and not foundation.lock
-        and progress.deepest > MAX_DEPTH_RATIO * foundation.depth
-    ):
+    if isinstance(foundation, Foundation) and not foundation.lock and progress.deepest > foundation.depth / 3:
         yield (
             f"the sheet was pressed {1000 * progress.deepest:.3g} mm into the {1000 * foundation.depth:.3g} mm of "
             "tissue.foundation.depth: beyond a third tissue gets much stiffer than this foundation, so that the true "
             "dent of a force is less deep, and the true force of a path larger; press less"
         )
-    if progress.longest_spring > MAX_SPRING_RATIO:
+    if progress.longest_spring > 2:
         yield (
             f"a spring was stretched to {progress.longest_spring:.2g} times its rest length, which no tissue "
             "withstands: press less, or with a wider tool"
@@ -334,7 +327,7 @@ def _mesh_remedy(plan: Plan, mesh: MeshEstimate, affords: Callable[[Plan], bool]
     """Suggest a remedy for the mesh error: a finer mesh, if it has at most four times the mass points."""
     scene, refinement = plan.scene, math.sqrt(mesh.error / (REMEDY_THRESHOLD / 2))
     rows, cols = (math.ceil((count - 1) * refinement) + 1 for count in scene.sheet.points)
-    allowed = rows * cols <= MAX_REFINEMENT * math.prod(scene.sheet.points) and max(rows, cols) < MAX_POINTS
+    allowed = rows * cols <= MAX_POINTS_RATIO * math.prod(scene.sheet.points) and max(rows, cols) < MAX_POINTS
     if allowed and affords(plan_variant(plan, with_points(scene, (rows, cols)))):
         return f"try sheet.points: {[rows, cols]}"
     return "tissue.bending, tissue.pretension or a wider tip help more than points do"

@@ -28,10 +28,10 @@ class VisibleRegion(NamedTuple):
     its second derivatives are at most 8 `sagitta_factor`. The length of the curve is at most 2 `stretch_factor` L.
     """
 
-    radius: float  # largest distance from the optical axis
+    radius: float  # largest distance from the optical axis, in normalised image coordinates
     box: tuple[float, float, float, float]  # left, right, top and bottom without distortion [px]
     sagitta_factor: float  # [1/px]
-    stretch_factor: float
+    stretch_factor: float  # without unit
 
 
 def visible_region(view: View) -> VisibleRegion:
