@@ -14,7 +14,7 @@ from benchmarks.process import ROOT
 from taichi_msm import load_scene
 from taichi_msm.model.loads import decay, evaluate_loads
 from taichi_msm.solver.planning import make_plan
-from taichi_msm.terms.elasticity import elastic_force, spring_families
+from tests import reference
 
 Array = NDArray[Any]
 
@@ -31,7 +31,7 @@ def integrate(rtol: float, largest: float = 0.03) -> Array:
     """
     plan = make_plan(load_scene(ROOT / "scenes" / "figure-3.yaml", ["output=[]"]))
     scene, shape = plan.scene, (*plan.scene.sheet.points, 3)
-    families, free = tuple(spring_families(plan)), ~plan.fixed[..., None]
+    assembled, free = reference.sheet(scene), ~plan.fixed[..., None]
     share = decay(scene.probes[0], scene.sheet)[..., None]
     frames = np.arange(1, plan.grid.frames + 1) / plan.grid.frames_per_second
     state, displacements = np.zeros((2, *shape)).ravel(), []
@@ -42,7 +42,7 @@ def integrate(rtol: float, largest: float = 0.03) -> Array:
         def motion(t: float, y: Array, first: float = start + margin, last: float = end - margin) -> Array:
             u, v = y.reshape(2, *shape)
             loads = evaluate_loads(plan, np.clip([t], first, last))
-            force = elastic_force(families, u) - loads.active[0] * plan.material.virtual * u
+            force = reference.elastic_force(scene, u, assembled) - loads.active[0] * plan.material.virtual * u
             force += share * loads.strength[0, 0]
             acceleration = (force - scene.damping * v) / scene.sheet.mass
             return np.stack([v, acceleration * free]).ravel()
