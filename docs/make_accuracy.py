@@ -21,7 +21,6 @@ from typing import Any
 from benchmarks import dop853, stored_form
 from benchmarks.marked import table
 from taichi_msm.study.measurements import REFERENCE_MARGIN, REFERENCE_RENDER
-from taichi_msm.study.result import PSNR_TOLERANCE_DB
 from taichi_msm.system.compiler import compiler_label
 
 ROOT = Path(__file__).parent.parent
@@ -190,12 +189,12 @@ def peer(study: Record) -> str:
 
 
 def enough(studies: dict[str, Record]) -> int:
-    """Return the refinement beyond which no scene improves."""
+    """Return the refinement beyond which no scene improves by 0.1 dB."""
     needed = []
     for study in studies.values():
         drawn = [point for point in study["drawing"] if point["supersample"] == 1]
         best = max(point["psnr"] for point in drawn)
-        needed.append(min(point["refine"] for point in drawn if point["psnr"] > best - PSNR_TOLERANCE_DB))
+        needed.append(min(point["refine"] for point in drawn if point["psnr"] > best - 0.1))
     return max(needed)
 
 

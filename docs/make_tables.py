@@ -12,8 +12,8 @@ from pathlib import Path
 from typing import Any
 
 from benchmarks.marked import replace_marked
-from taichi_msm.camera_files import calibrations, trajectories
 from taichi_msm.camera_files.calibration import CalibrationReader
+from taichi_msm.camera_files.readers import CALIBRATION_READERS, TRAJECTORY_READERS
 from taichi_msm.camera_files.trajectory import TrajectoryReader
 from taichi_msm.load.scene_file import schema
 from taichi_msm.scene.section import Section
@@ -79,8 +79,8 @@ TABLES: dict[tuple[str, str], Callable[[], str]] = {
     ("view", "hands"): page_keys,
     ("sweep", "sweep keys"): partial(model_keys, SweepSettings, "key", "meaning", "value", "default"),
     ("sweep", "distributions"): partial(model_keys, Distribution, "way", "how the key varies", "value"),
-    ("cameras", "calibrations"): partial(readers, calibrations.READERS),
-    ("cameras", "trajectories"): partial(readers, trajectories.READERS),
+    ("cameras", "calibrations"): partial(readers, CALIBRATION_READERS),
+    ("cameras", "trajectories"): partial(readers, TRAJECTORY_READERS),
 }
 
 

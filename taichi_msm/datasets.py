@@ -27,19 +27,16 @@ from taichi_msm.errors import ArgumentError, FilesError, NotInstalledError
 from taichi_msm.runs.arrays import read_flo
 from taichi_msm.scene.outputs import OUTPUTS
 
-# The magnitude of unknown flow in a file is larger [px].
-MAX_FLOW_PX = 1e9
-
 
 class Pair(TypedDict):
     """Two successive frames, and the labels of the first."""
 
     first: NDArray[np.uint8]  # RGB, shape (3, height, width)
-    second: NDArray[np.uint8]
+    second: NDArray[np.uint8]  # of the same shape
     flow: NDArray[np.float32]  # displacement to the right and down [px], shape (2, height, width)
-    valid: NDArray[np.bool_]  # where flow is known: tissue, not an instrument or the background; shape (height, width)
-    occluded: NDArray[np.bool_]  # where the tissue is hidden or outside the picture in the second frame
-    depth: NDArray[np.float32]  # along the viewing direction [m]; 0: background
+    valid: NDArray[np.bool_]  # whether flow is known, which is on tissue; shape (height, width)
+    occluded: NDArray[np.bool_]  # tissue hidden or outside the picture in the second frame; shape (height, width)
+    depth: NDArray[np.float32]  # along the viewing direction [m], 0 on the background; shape (height, width)
 
 
 class Clip(TypedDict):
@@ -53,7 +50,7 @@ class Clip(TypedDict):
 class _Split:
     """Runs of a split of a data set, cut into items of `length` frames that begin every `stride` frames."""
 
-    outputs: ClassVar[tuple[str, ...]]  # that the items are made of, as in `output` of a scene
+    outputs: ClassVar[tuple[str, ...]]  # required entries of `output`
 
     def __init__(self, directory: str | Path, split: str, length: int, stride: int, camera: str) -> None:
         self.directory, self._camera = Path(directory), camera
@@ -120,7 +117,7 @@ class Pairs(_Split):
         folder, frame = self._find(index)
         width, height = self.runs[index // self._items].get("size", self._size)
         flow = read_flo(folder / OUTPUTS["flow"].path(frame), (width, height)).transpose(2, 0, 1)
-        valid = np.abs(flow).max(axis=0) < MAX_FLOW_PX
+        valid = np.abs(flow).max(axis=0) < 1e9  # The magnitude of unknown flow in a file is larger [px].
         return {
             "first": _pixels(folder, "png", frame).transpose(2, 0, 1),
             "second": _pixels(folder, "png", frame + 1).transpose(2, 0, 1),

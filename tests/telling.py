@@ -24,17 +24,17 @@ def tell(stage, done):
 def exit_on_signals(original=process.exit_on_signals):
     original()
     tell("heard", 0)
-    from taichi_msm.cli import session  # as the program does next
+    from taichi_msm.cli import common  # as the program does next
 
     @contextmanager
-    def show_progress(*arguments, original=session.show_progress, **named):
+    def show_progress(*arguments, original=common.show_progress, **named):
         with original(*arguments, **named) as progress:
             def telling(stage, done, total):
                 tell(stage, done)
                 progress(stage, done, total)
             yield telling
 
-    session.show_progress = show_progress
+    common.show_progress = show_progress
 
 process.exit_on_signals = exit_on_signals
 runpy.run_module("taichi_msm", run_name="__main__")

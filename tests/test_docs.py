@@ -21,8 +21,8 @@ import yaml
 from PIL import Image
 
 import taichi_msm
+from taichi_msm.cli import common
 from taichi_msm.cli import options as cli_options
-from taichi_msm.cli import session
 from taichi_msm.exports.formats import FORMATS
 from taichi_msm.load.scene_file import load_scene, schema
 from taichi_msm.runs.run import run
@@ -191,7 +191,7 @@ def test_tables_are_complete() -> None:
     assert sorted(words(table(DOCS / "files.md", "record"))) == sorted(get_type_hints(RunRecord))
     assert words(table(DOCS / "error.md", "estimate")) == list(get_type_hints(ErrorRecord))
     assert sorted(words(table(DOCS / "export.md", "formats"))) == sorted(FORMATS)
-    codes = {session.DONE, session.BUG, session.INVALID_INPUT, session.DIVERGED, session.FILES, 130, 143}
+    codes = {common.DONE, common.BUG, common.INVALID_INPUT, common.DIVERGED, common.FILES, 130, 143}
     assert re.findall(r"\d+", " ".join(table(DOCS / "command-line.md", "exit codes"))) == [*map(str, sorted(codes))]
 
 

@@ -13,6 +13,7 @@ from taichi_msm.errors import ArgumentError, SceneError
 from taichi_msm.fitting.fit import fit
 from taichi_msm.load.scene_file import load_scene
 from taichi_msm.runs.simulation import Player
+from taichi_msm.sweeps.spec import load_sweep
 from tests.golden import Messages, read
 from tests.scenes import scene
 
@@ -55,6 +56,14 @@ def test_unusable_calibration_files(name: str, small: Path, message: Messages) -
         load_scene("small.yaml", ["render.camera={calibration: c.yaml, scale: true, eye: [0, 0, 1]}"])
 
 
+@pytest.mark.parametrize("key", ["springs.shear: '=sqrt(1, 2)'", "damping=1: 0.01"], ids=["arguments", "path"])
+def test_invalid_keys_of_sweeps(key: str, small: Path, message: Messages) -> None:
+    vary = "damping: {uniform: [0.01, 0.02]}"
+    Path("sweep.yaml").write_text(f"{{scene: small.yaml, samples: 1, vary: {{{vary}}}, set: {{{key}}}}}")
+    with message.raises(SceneError):
+        load_sweep("sweep.yaml")
+
+
 def test_player_without_frames(message: Messages) -> None:
     with message.raises(ArgumentError, "frames"):
         Player([], 25)
@@ -82,7 +91,7 @@ def test_invalid_options_of_fits(free: list[str], options: dict[str, object], me
 # Messages of processes killed at a certain moment, of foreign machines and of defects, by their longest fixed part.
 NOT_PROVOKED = {
     ", or smaller --bounds",
-    "; install there what is here",
+    "; install the same packages there",
     "; use these, or choose another --out",
     "=LOW,HIGH, factors of young",
     ": missing; put the picture back, the scene needs a copy of it",
@@ -94,7 +103,6 @@ NOT_PROVOKED = {
     "a run of the fit ended early:",
     "another command for the same folder has ended meanwhile",
     "interrupted while the sheet was restarted; restart the scene",
-    "is neither true nor false",
     "is no number; expected",
     "is not a writable directory",
     "lost the scheduler at",

@@ -44,7 +44,7 @@ from taichi_msm.errors import DivergedError, Pause, ProgressCallback, SceneError
 from taichi_msm.model.plan import Plan
 from taichi_msm.model.sheet import MAX_CELL_ASPECT, Maps, cell_aspect_ratio, spacing
 from taichi_msm.model.tool_force import sum_probe_forces
-from taichi_msm.model.tools import touching_tools
+from taichi_msm.model.tools import overlap, touching_tools
 from taichi_msm.scene.scene import Scene
 from taichi_msm.scene.section import MAX_POINTS
 from taichi_msm.scene.sheet import Sheet
@@ -83,6 +83,7 @@ NO_CONTACT = "a tool on a path meets no point"
 NARROW_TIP = "the radius of a tool on a path is below 0.8 of a cell, so that it touches hardly a point"
 LARGE_STEP_ERROR = "the error of the time step is larger than the largest displacement"
 NOT_CONVERGED = "runs whose points are not as close do not approach the run"
+OVERLAP = "the instruments of two tools run through each other, so that the solution is not unique"
 WRINKLING = "tissue without bending is pressed together, and with more points wrinkles more"
 
 
@@ -189,6 +190,7 @@ class MeshCompanion:
         self._differences = [0.0 for _ in plans]
         self._sampling_error = _sampling_force_error(plan.scene)
         self._contact = plan.has_contact
+        self._overlap = overlap(plan.tools, plan.scene.time.duration) is not None
         cell = max(spacing(plan.scene.sheet))
         self._narrow = any(tool.radius < MIN_RADIUS_CELLS * cell for tool in touching_tools(plan.tools))
         self._largest, self._shortest_spring = 0.0, 1.0
@@ -284,7 +286,8 @@ class MeshCompanion:
             if self._second_run is None or not self._second_run._relative_difference <= MAX_DIFFERENCE:
                 return MeshEstimate(math.inf, NOT_CONVERGED)
             error = SECOND_ERROR_FACTOR * math.sqrt(difference * self._second_run._relative_difference)
-        return MeshEstimate(error + self._sampling_error, WRINKLING if self._may_wrinkle else "", at_most=True)
+        doubt = OVERLAP if self._overlap else WRINKLING if self._may_wrinkle else ""
+        return MeshEstimate(error + self._sampling_error, doubt, at_most=True)
 
 
 def with_points(scene: Scene, points: tuple[int, int]) -> Scene:

@@ -1,1 +1,1 @@
-"""Readers of camera calibrations and trajectories from other programs: a file per format, behind two tables."""
+"""Camera calibrations and trajectories of other programs: a file per format, and the tables of `readers`."""

@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from typing import NamedTuple
 
-from taichi_msm.camera_files.keys import Keys
-from taichi_msm.camera_files.text import CameraFile
+from taichi_msm.camera_files.camera_file import CameraFile
+from taichi_msm.camera_files.key_lookup import Keys
 
 
 class StereoPose(NamedTuple):
@@ -27,7 +27,12 @@ class Calibration(NamedTuple):
     right: StereoPose | None = None  # pose of the right camera of a stereo pair, where that was asked for
 
     def scaled(self, scale_x: float, scale_y: float) -> Calibration:
-        """Return the calibration for pictures that are scaled by these factors, edges to edges."""
+        """Return the calibration for scaled pictures, edges to edges.
+
+        Args:
+            scale_x: new width over old width.
+            scale_y: new height over old height.
+        """
         (cx, cy), lens = self.centre, dict(self.coefficients)
         focal = None if self.focal is None else (self.focal[0] * scale_x, self.focal[1] * scale_y)
         if self.model == "scaramuzza":
@@ -40,6 +45,24 @@ class Calibration(NamedTuple):
         return self._replace(focal=focal, centre=centre, coefficients=lens)
 
 
+def focal_fault(focal: Sequence[float], size: Sequence[float]) -> str:
+    """Return the fault of focal lengths that are not in pixels, and its remedy; "" for plausible ones.
+
+    The limit is a twentieth of the picture. A perspective view would then exceed 168 degrees, where the widest lenses
+    have 140; and the image circle of an equidistant fisheye that sees the whole sphere, of diameter 2 pi f, would
+    cover less than a third of the picture. Focal lengths in millimetres or in widths of the picture are below it.
+
+    Args:
+        focal: focal lengths fx, fy [px].
+        size: width and height of the pictures [px].
+    """
+    for name, extent, length, pixels in zip(("fx", "fy"), ("wide", "high"), focal, size, strict=True):
+        if length < pixels / 20:
+            fault = f"{name} = {length:g} is below 1/20 of a picture {pixels:g} px {extent}, shorter than of any lens"
+            return f"{fault}; write it in pixels (normalised: times {pixels:g}; in mm: divided by the pixel pitch)"
+    return ""
+
+
 class CalibrationReader(NamedTuple):
     """Reader of a format of calibrations."""
 
@@ -49,4 +72,4 @@ class CalibrationReader(NamedTuple):
     read: Callable[[Keys], Calibration]
     # Pose of the right camera, in the unit of the file, from the keys of this camera.
     pose: Callable[[Keys], StereoPose | None] = lambda keys: None
-    unit: float | None = 1.0  # unit of lengths in the file [m]; None where it depends on who wrote the file
+    unit: float | None = 1.0  # unit of lengths in the file [m]; None where the format does not define it

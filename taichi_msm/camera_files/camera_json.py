@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from taichi_msm.camera_files.calibration import Calibration, CalibrationReader
-from taichi_msm.camera_files.keys import Keys
-from taichi_msm.camera_files.text import CameraFile
+from taichi_msm.camera_files.camera_file import CameraFile
+from taichi_msm.camera_files.key_lookup import Keys
 from taichi_msm.errors import truncate
 from taichi_msm.lenses import MODELS
 
@@ -22,7 +22,7 @@ def _read(keys: Keys) -> Calibration:
     """Read `calibration`, not `intrinsics`, whose first pixel has its centre at (0.5, 0.5)."""
     model = keys.data["model"]
     if model not in MODELS:
-        fault = f"model: {truncate(str(model))} is not known; expected one of: {', '.join(MODELS)}"
+        fault = f"model: {truncate(str(model))} is not supported; expected one of: {', '.join(MODELS)}"
         raise keys.file.fault(fault)
     names = tuple(MODELS[model].coefficients)
     fx, _, cx, _, fy, cy, *_ = keys.require("calibration", 9, "calibration")

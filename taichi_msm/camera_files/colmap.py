@@ -6,9 +6,9 @@ import re
 from collections.abc import Sequence
 
 from taichi_msm.camera_files.calibration import CalibrationReader
-from taichi_msm.camera_files.keys import Keys, listed
+from taichi_msm.camera_files.camera_file import CameraFile, listed
+from taichi_msm.camera_files.key_lookup import Keys
 from taichi_msm.camera_files.opencv import read_camera
-from taichi_msm.camera_files.text import CameraFile
 from taichi_msm.camera_files.trajectory import Trajectory, TrajectoryReader, parse_numbers, pose_fault
 
 # A line of cameras.txt: id, model, width, height, parameters.
@@ -35,21 +35,26 @@ MODELS = {
 
 def _cameras(file: CameraFile) -> Sequence[Keys]:
     """Return the only camera, with OpenCV's keys; COLMAP's first pixel has its centre at (0.5, 0.5)."""
-    cameras = CAMERA.findall(file.text)
-    if any(camera[1:] != cameras[0][1:] for camera in cameras):
-        raise file.fault(f"has several cameras, {listed(camera[0] for camera in cameras)}; keep the line of one")
-    return [_camera(file, *camera) for _, *camera in cameras[:1]]
+    cameras = list(CAMERA.finditer(file.text))
+    lines = [1 + file.text.count("\n", 0, camera.start()) for camera in cameras]
+    for camera, line in zip(cameras, lines, strict=True):
+        if camera.groups()[1:] != cameras[0].groups()[1:]:
+            names = listed(camera[1] for camera in cameras)
+            raise file.fault(f"has several cameras, {names}; keep the line of one", line)
+    return [_camera(file, line, *camera.groups()[1:]) for camera, line in zip(cameras[:1], lines, strict=False)]
 
 
-def _camera(file: CameraFile, name: str, width: str, height: str, parameters: str) -> Keys:
+def _camera(file: CameraFile, line: int, name: str, width: str, height: str, parameters: str) -> Keys:
     if name not in MODELS:
-        raise file.fault(f"{name}: a model that is not known; expected one of: {', '.join(MODELS)}")
+        raise file.fault(f"{name}: a model that is not supported; expected one of: {', '.join(MODELS)}", line)
     focal_count, model, coefficient_count = MODELS[name]
-    numbers = Keys(file, {"PARAMS": parameters}).require("params", focal_count + 2 + coefficient_count, name)
+    count, lines = focal_count + 2 + coefficient_count, {"PARAMS": line}
+    numbers = Keys(file, {"PARAMS": parameters}, lines=lines).require("params", count, name)
     fx, fy, (cx, cy) = numbers[0], numbers[focal_count - 1], numbers[focal_count : focal_count + 2]
     values = [*numbers[focal_count + 2 :], *[0.0] * 4][: max(4, coefficient_count)]
     matrix = [fx, 0, cx - 0.5, 0, fy, cy - 0.5, 0, 0, 1]
-    return Keys(file, {"K": matrix, "D": values, "model": model, "size": [width, height]})
+    data = {"K": matrix, "D": values, "model": model, "size": [width, height]}
+    return Keys(file, data, lines=dict.fromkeys(data, line))
 
 
 def _read_images(file: CameraFile) -> Trajectory | None:

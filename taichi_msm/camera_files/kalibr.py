@@ -6,13 +6,13 @@ The sensor.yaml of EuRoC has the keys of a section.
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping, Sequence
-from typing import Any
+from collections.abc import Sequence
+from typing import Any, TypeGuard
 
 from taichi_msm.camera_files.calibration import CalibrationReader, StereoPose
-from taichi_msm.camera_files.keys import Keys, flat, listed
+from taichi_msm.camera_files.camera_file import CameraFile, Entries, listed
+from taichi_msm.camera_files.key_lookup import Keys, flat
 from taichi_msm.camera_files.opencv import read_camera
-from taichi_msm.camera_files.text import CameraFile
 from taichi_msm.errors import truncate
 
 # Camera models, each with the number of its intrinsics.
@@ -24,7 +24,7 @@ def _cameras(file: CameraFile) -> Sequence[Keys]:
     if _is_camera(file.data):
         return [_camera(file, "", file.data)]
     names = [name for name, section in file.data.items() if _is_camera(section)]
-    return [_camera(file, f"{name}: ", file.data[name]) for name in sorted(names, key=_number)]
+    return [_camera(file, f"{name}: ", file.data[name]) for name in sorted(names, key=_sort_key)]
 
 
 def _pose(keys: Keys) -> StereoPose | None:
@@ -35,27 +35,30 @@ def _pose(keys: Keys) -> StereoPose | None:
     return StereoPose(tuple(tuple(rows[n : n + 3]) for n in (0, 4, 8)), tuple(rows[3:12:4]))
 
 
-def _is_camera(section: Any) -> bool:
+def _is_camera(section: Any) -> TypeGuard[Entries]:
     """Return whether a section has a model and its numbers; nine of them would be a matrix."""
     return (
-        isinstance(section, dict) and "camera_model" in section and len(flat(section.get("intrinsics"))) not in (1, 9)
+        isinstance(section, Entries)
+        and "camera_model" in section
+        and len(flat(section.get("intrinsics"))) not in (1, 9)
     )
 
 
-def _camera(file: CameraFile, prefix: str, section: Mapping[str, Any]) -> Keys:
+def _camera(file: CameraFile, prefix: str, section: Entries) -> Keys:
     """Return a section with a matrix in place of the intrinsics, which of `omni` begin with xi."""
     numbers, model = flat(section["intrinsics"]), str(section["camera_model"]).lower()
     if model not in INTRINSICS:
-        fault = f"{prefix}camera_model: {truncate(model)} is not known; found {listed(section)}"
-        raise file.fault(f"{fault}; expected one of: {', '.join(INTRINSICS)}")
+        fault = f"{prefix}camera_model: {truncate(model)} is not supported; found {listed(section)}"
+        raise file.fault(f"{fault}; expected one of: {', '.join(INTRINSICS)}", section.lines.get("camera_model"))
     if len(numbers) != INTRINSICS[model]:
         fault = f"{prefix}intrinsics: {len(numbers)} numbers, where {INTRINSICS[model]} belong to {model}"
-        raise file.fault(f"{fault}; write what belongs there")
+        raise file.fault(f"{fault}; write {INTRINSICS[model]} numbers", section.lines.get("intrinsics"))
     *xi, fx, fy, cx, cy = numbers
-    return Keys(file, {**section, "intrinsics": [fx, 0, cx, 0, fy, cy, 0, 0, 1], **({"xi": xi} if xi else {})})
+    data = {**section, "intrinsics": [fx, 0, cx, 0, fy, cy, 0, 0, 1], **({"xi": xi} if xi else {})}
+    return Keys(file, data, lines=section.lines)
 
 
-def _number(name: object) -> tuple[int, str]:
+def _sort_key(name: object) -> tuple[int, str]:
     match = re.search(r"\d+", str(name))
     return int(match[0]) if match else 0, str(name)
 

@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from taichi_msm.camera_files.calibration import Calibration, CalibrationReader
-from taichi_msm.camera_files.keys import Keys
-from taichi_msm.camera_files.text import CameraFile
+from taichi_msm.camera_files.camera_file import CameraFile
+from taichi_msm.camera_files.key_lookup import Keys
 from taichi_msm.lenses import MODELS
 
 # Lines that are neither empty nor comments, in their order, each with its number of values.
@@ -18,8 +18,11 @@ def _cameras(file: CameraFile) -> Sequence[Keys]:
     """Return the only camera, if the file begins with that comment."""
     if not file.text.lstrip().startswith("#polynomial coefficients"):
         return ()
-    lines = [line.strip() for line in file.text.splitlines()]
-    return [Keys(file, dict(zip(LINES, (line for line in lines if line and line[0] != "#"), strict=False)))]
+    lines = [(n, line.strip()) for n, line in enumerate(file.text.splitlines(), 1)]
+    rows = dict(zip(LINES, ((n, line) for n, line in lines if line and line[0] != "#"), strict=False))
+    return [
+        Keys(file, {name: line for name, (_, line) in rows.items()}, lines={name: n for name, (n, _) in rows.items()})
+    ]
 
 
 def _read(keys: Keys) -> Calibration:
@@ -33,9 +36,8 @@ def _read(keys: Keys) -> Calibration:
     a0, a1, *powers = [*polynomial, *[0.0] * DEGREE][: DEGREE + 1]
     if len(polynomial) != count or a1 or any(polynomial[DEGREE + 1 :]) or a0 >= 0 or c <= 0:
         fault = f"polynomial: {keys.data.get('polynomial')}"
-        raise keys.file.fault(
-            f"{fault}; expected its length, up to {DEGREE + 1}, a0 below 0, a1 = 0, a2, a3, a4, and c above 0"
-        )
+        expected = f"its length, up to {DEGREE + 1}, a0 below 0, a1 = 0, a2, a3, a4, and c above 0"
+        raise keys.fault(f"{fault}; expected {expected}", "polynomial")
     values = [-c * a0, *(-a / c**n for n, a in enumerate(powers, 1)), 1 / c, e / c, d / c]
     lens = dict(zip(MODELS["scaramuzza"].coefficients, values, strict=True))
     return Calibration(None, (column, row), (round(width), round(height)), "scaramuzza", lens)

@@ -9,9 +9,9 @@ import math
 import re
 from collections.abc import Sequence
 
-from taichi_msm.camera_files.calibration import Calibration, CalibrationReader, StereoPose
-from taichi_msm.camera_files.keys import ROUNDING_TOLERANCE, Keys, fold, listed
-from taichi_msm.camera_files.text import CameraFile
+from taichi_msm.camera_files.calibration import Calibration, CalibrationReader, StereoPose, focal_fault
+from taichi_msm.camera_files.camera_file import listed
+from taichi_msm.camera_files.key_lookup import ROUNDING_TOLERANCE, Keys, fold
 from taichi_msm.errors import truncate
 from taichi_msm.lenses import MODELS
 
@@ -47,7 +47,7 @@ LENSES = {
     **dict.fromkeys(("pinhole", "perspective", "mono", "monocular"), ""),
     **dict.fromkeys(("plumbbob", "rationalpolynomial", "rational", "radtan", "radialtangential", "opencv"), "pinhole"),
     **dict.fromkeys(("equidistant", "equi", "fisheye", "opencvfisheye", "kannalabrandt", "kannalabrandt4"), "fisheye"),
-    **dict.fromkeys(("omnidir", "omnidirectional", "omni", "mei", "unified"), "omnidir"),
+    **dict.fromkeys(("omnidir", "omnidirectional", "omni", "unified"), "omnidir"),
     **dict.fromkeys(("none", "nodistortion", "undistorted"), NO_DISTORTION),
 }
 FLAGS = {
@@ -55,44 +55,40 @@ FLAGS = {
     **dict.fromkeys(("0", "false", "no", "off"), "pinhole"),
 }
 
-# Coefficients after these are not supported and must be 0.
-SUPPORTED_COEFFICIENTS = 8
-
-# Smallest focal length [px].
-MIN_FOCAL_LENGTH_PX = 1e-3
-
 _REMEDY = "write camera_matrix: [fx, 0, cx, 0, fy, cy, 0, 0, 1], distortion_coefficients: [k1, k2, p1, p2]"
 
 
 def read_camera(keys: Keys) -> Calibration:
-    """Read the keys of a camera."""
+    """Read a calibration from the keys of a camera."""
     file, matrix, values = keys.file, keys.numbers(MATRIX), keys.numbers(COEFFICIENTS)
     if matrix is None:
-        raise file.fault(f"has no camera matrix that is known; found {keys}; {_REMEDY}")
+        raise file.fault(f"has no known camera matrix; found {keys}; {_REMEDY}")
+    name = keys.find(MATRIX)
     if len(matrix) != 9 or [matrix[n] for n in (1, 3, 6, 7, 8)] != [0, 0, 0, 0, 1] or min(matrix[::4]) <= 0:
-        raise file.fault("its camera matrix is not [fx, 0, cx, 0, fy, cy, 0, 0, 1]; write it like that")
+        raise keys.fault(f"{name}: is not [fx, 0, cx, 0, fy, cy, 0, 0, 1]; write the camera matrix like that", name)
     (fx, _, cx), (_, fy, cy) = matrix[:3], matrix[3:6]
-    if (focal := min(fx, fy)) < MIN_FOCAL_LENGTH_PX:
-        raise file.fault(f"its focal length is {focal:g}; write it in pixels, {MIN_FOCAL_LENGTH_PX:g} or more")
     _require_agreement(keys, (fx, fy), (cx, cy))
     xi = keys.numbers("xi") or []
     model = _model(keys, values or (), has_xi=any(xi))
     if values is None and model != NO_DISTORTION:
-        fault = "has a camera matrix, and no distortion that is known"
+        fault = "has a camera matrix, but no known distortion"
         remedy = "write distortion_coefficients, [0, 0, 0, 0] where there is none"
         raise file.fault(f"{fault}; found {keys}; {remedy}")
     size = _size(keys)
+    if size and (fault := focal_fault((fx, fy), size)):
+        raise keys.fault(f"{name}: {fault}", name)
     if names := keys.unread(UNSUPPORTED):
         fault = f"{listed(names)}: not understood, and may change the picture"
-        raise file.fault(f"{fault}; found {keys}; {_REMEDY}, or remove what does not matter")
+        raise keys.fault(f"{fault}; found {keys}; {_REMEDY}, or remove the keys that do not matter", names[0])
     model, values = ("pinhole", []) if model == NO_DISTORTION else (model, values or [])
-    lens = _coefficients(file, model, [*xi, *values] if model == "omnidir" else values)
+    lens = _coefficients(keys, model, [*xi, *values] if model == "omnidir" else values)
     return Calibration((fx, fy), (cx, cy), size, model, lens)
 
 
 def read_pose(keys: Keys) -> StereoPose | None:
     """Read R and T, which have no mark; R1 and R2 would be rotations of the rectification."""
-    shared = Keys(keys.file, {name: keys.data[name] for name in keys.data if keys.folded[name] == fold(name)})
+    unmarked = {name: value for name, value in keys.data.items() if keys.folded[name] == fold(name)}
+    shared = Keys(keys.file, unmarked, lines=keys.lines)
     if not shared.values(ROTATION) and not shared.values(TRANSLATION):
         return None
     rotation = shared.require(ROTATION, 9, "rotation R")
@@ -109,10 +105,8 @@ def _require_agreement(keys: Keys, focal: Sequence[float], centre: Sequence[floa
         if numbers and not all(
             math.isclose(a, b, rel_tol=ROUNDING_TOLERANCE) for a, b in zip(numbers, values, strict=False)
         ):
-            found = ", ".join(f"{number:g}" for number in numbers)
-            raise keys.file.fault(
-                f"{listed(keys.values(spelling))}: {found}, and the camera matrix has others; keep one"
-            )
+            names, found = listed(keys.values(spelling)), ", ".join(f"{number:g}" for number in numbers)
+            raise keys.fault(f"{names}: {found}, and the camera matrix has others; keep one", keys.find(spelling))
 
 
 def _model(keys: Keys, values: Sequence[float], *, has_xi: bool) -> str:
@@ -124,36 +118,37 @@ def _model(keys: Keys, values: Sequence[float], *, has_xi: bool) -> str:
             if re.fullmatch(LENS_OR_DEVICE, keys.folded[name]):
                 continue  # The name of a device.
             known = "plumb_bob, radtan, rational_polynomial, equidistant, fisheye, omnidir, none"
-            fault = f"{name}: {truncate(str(value))} is not known; found {keys}"
-            raise keys.file.fault(f"{fault}; expected one of: {known}")
+            raise keys.fault(f"{name}: {truncate(str(value))} is not supported; expected one of: {known}", name)
         if model == NO_DISTORTION and any(values):
             coefficients = ", ".join(f"{number:g}" for number in values)
             remedy = "write the model of these, such as plumb_bob or equidistant, or zeros"
-            raise keys.file.fault(f"{name}: {value}, and coefficients that are not 0: {coefficients}; {remedy}")
+            raise keys.fault(f"{name}: {value}, and coefficients that are not 0: {coefficients}; {remedy}", name)
         sources |= {model: name} if model else {}
     for name, value in keys.values(FISHEYE).items():
         if (flag := fold(value)) not in FLAGS:
-            raise keys.file.fault(f"{name}: {truncate(str(value))} is neither true nor false")
+            raise keys.fault(f"{name}: {truncate(str(value))} is neither true nor false; write one of them", name)
         sources[FLAGS[flag]] = name
     if {"omnidir", NO_DISTORTION} & sources.keys():
         sources.pop("pinhole", None)  # As its distortion, or none of it.
     if len(sources) > 1:
-        (one, first), (other, second), *_ = sources.items()
-        raise keys.file.fault(f"{first} is {one}, {second} is {other}; keep the right one")
+        (model, name), (model_2, name_2), *_ = sources.items()
+        raise keys.fault(f"{name} is {model}, {name_2} is {model_2}; keep the right one", name_2)
     return next(iter(sources), "pinhole")
 
 
-def _coefficients(file: CameraFile, model: str, values: Sequence[float]) -> dict[str, float]:
+def _coefficients(keys: Keys, model: str, values: Sequence[float]) -> dict[str, float]:
     """Return the coefficients of a lens model by their names; trailing ones may be missing."""
     names = tuple(MODELS[model].coefficients)
     if len(values) not in ((0, 4, 5, 8, 12, 14) if model == "pinhole" else (len(names),)):
         expected = "4, 5, 8, 12 or 14: k1, k2, p1, p2, k3, ..." if model == "pinhole" else f"those of {model}: "
         expected += "" if model == "pinhole" else ", ".join(names)
-        raise file.fault(f"{len(values)} distortion coefficients; expected {expected}")
-    if any(others := values[SUPPORTED_COEFFICIENTS:]):
-        number = 1 + SUPPORTED_COEFFICIENTS + next(n for n, value in enumerate(others) if value)
+        raise keys.fault(f"{len(values)} distortion coefficients; expected {expected}", keys.find(COEFFICIENTS))
+    # OpenCV's coefficients after k6.
+    if any(values[8:]):
+        number = next(n for n, value in enumerate(values, 1) if n > 8 and value)
         fault = f"distortion coefficient {number} is not 0"
-        raise file.fault(f"{fault}; thin prisms and tilted sensors are not modelled, calibrate without")
+        remedy = "thin prisms and tilted sensors are not modelled, calibrate without"
+        raise keys.fault(f"{fault}; {remedy}", keys.find(COEFFICIENTS))
     return dict(zip(names, values, strict=False))
 
 
@@ -161,20 +156,26 @@ def _size(keys: Keys) -> tuple[int, int] | None:
     """Return the width and height of the pictures [px], or None if the file does not contain them."""
     width, height, both = (keys.numbers(spelling) for spelling in (WIDTH, HEIGHT, SIZE))
     if bool(width) != bool(height):
-        raise keys.file.fault(f"has only one of image_width and image_height; found {keys}; write both")
+        name = keys.find(WIDTH) or keys.find(HEIGHT)
+        raise keys.fault(f"has only one of image_width and image_height; found {keys}; write both", name)
     sizes = [width + height] if width and height else []
     sizes += [both] if both else []
     if any(len(size) != 2 or size != sizes[0] or min(size) < 1 for size in sizes):
         text = " and ".join(f"[{', '.join(f'{number:g}' for number in size)}]" for size in sizes)
-        raise keys.file.fault(f"its size is {text}; write one [width, height] of the pictures")
+        name = keys.find(SIZE) or keys.find(WIDTH)
+        raise keys.fault(f"its size is {text}; write one [width, height] of the pictures", name)
     size = (round(sizes[0][0]), round(sizes[0][1])) if sizes else None
     # ROS may bin or crop pictures, while its camera matrix remains that of the full picture.
-    regions = keys.values("roi", dict).values()
-    is_cropped = any(region.get(name) for region in regions for name in ("x_offset", "y_offset"))
-    is_cropped |= any(region.get("width") not in (None, 0, *(size or ())[:1]) for region in regions)
-    if is_cropped or any(value not in (0, 1) for value in keys.values("binning[xy]").values()):
-        fault = "of pictures that are binned or cut, while its camera matrix is of whole ones"
-        raise keys.file.fault(f"{fault}; write that of the pictures, without binning_x, binning_y and roi")
+    regions = keys.values("roi", dict)
+    faults = [name for name, value in keys.values("binning[xy]").items() if value not in (0, 1)]
+    for name, region in regions.items():
+        is_narrower = region.get("width") not in (None, 0, *(size or ())[:1])
+        if is_narrower or any(region.get(offset) for offset in ("x_offset", "y_offset")):
+            faults.append(name)
+    if faults:
+        fault = f"{listed(faults)}: binned or cropped pictures, and a camera matrix of full ones"
+        remedy = "write that of the pictures, without binning_x, binning_y and roi"
+        raise keys.fault(f"{fault}; {remedy}", faults[0])
     return size
 
 

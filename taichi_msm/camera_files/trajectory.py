@@ -6,7 +6,7 @@ import math
 from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
-from taichi_msm.camera_files.text import CameraFile
+from taichi_msm.camera_files.camera_file import CameraFile
 
 # Largest deviation from 1 of the norm of a quaternion, and from 0 of the entries of R R^T - 1.
 NORM_TOLERANCE = 1e-3
@@ -49,10 +49,15 @@ def parse_numbers(words: Sequence[str]) -> list[float] | None:
 
 
 def pose_fault(row: Sequence[float], previous: Sequence[float] | None) -> str:
-    """Return the fault of a row (time [s], position [m], quaternion) after the previous one, and its remedy."""
+    """Return the fault of a pose and its remedy; "" if there is none.
+
+    Args:
+        row: time [s], position x, y, z [m], quaternion x, y, z, w.
+        previous: row before it, for the order of times; None for the first.
+    """
     if previous is not None and row[0] <= previous[0]:
         times = f"is at {row[0]:.15g} s, the pose before it at {previous[0]:.15g} s"
         return f"{times}; sort them, each later than the last"
     if abs(math.hypot(*row[4:]) - 1) > NORM_TOLERANCE:
-        return f"its quaternion has the length {math.hypot(*row[4:]):g}, so it is no rotation; write one of length 1"
+        return f"its quaternion has the length {math.hypot(*row[4:]):g}, which is not a rotation; normalise it to 1"
     return ""

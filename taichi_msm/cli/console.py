@@ -23,10 +23,10 @@ STAGES = {
     "check": "checking the finished frames",
     "redraw": "drawing finished frames",
     "frames": "simulating",
-    "diagnosis": "finding out why it diverged",
+    "diagnosis": "diagnosing the divergence",
     "stepping": "measuring the stepping",
     "drawing": "measuring the drawing",
-    "points": "measuring other numbers of points",
+    "points": "measuring other meshes",
     "write": "writing",
     "film": "filming",
     "export": "exporting",
@@ -40,7 +40,11 @@ LINE_INTERVAL_S = 10.0
 
 
 class ProgressDisplay:
-    """Progress on stderr: a bar on a terminal, otherwise a line every `LINE_INTERVAL_S`."""
+    """Progress on stderr: a bar on a terminal, otherwise a line every `LINE_INTERVAL_S`.
+
+    Args:
+        quiet: whether to show nothing.
+    """
 
     def __init__(self, quiet: bool) -> None:
         self._quiet = quiet
@@ -51,7 +55,13 @@ class ProgressDisplay:
             self._task = self._bar.add_task(STAGES["start"], total=None, left="")
 
     def update(self, stage: str, done: int, total: int) -> None:
-        """Show the finished and all items of a stage, and its remaining time; a total of 0 is unknown."""
+        """Show the progress of a stage, and its estimated remaining time.
+
+        Args:
+            stage: key of `STAGES`.
+            done: number of finished items.
+            total: number of all items; 0 if unknown.
+        """
         if self._quiet:
             return
         now = time.monotonic()
@@ -103,7 +113,15 @@ def _bar() -> Bar:
 
 
 def run_summary(record: Mapping[str, Any], directory: Path) -> str:
-    """Summarise the record of a run in a few lines: frames, steps, forces, warnings and timings."""
+    """Summarise a run in a few lines: frames, steps, forces, warnings and timings.
+
+    Args:
+        record: content of its run.json.
+        directory: of its results.
+
+    Returns:
+        Lines for the terminal, as one text.
+    """
     times, (rows, cols) = record["timings"], record["points"]
     stages = ", ".join(f"{stage} {seconds:.2f}" for stage, seconds in times.items() if stage != "total")
     parallel = times["encode"] > 0 and record["threads"] > 1

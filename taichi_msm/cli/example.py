@@ -26,7 +26,7 @@ def example(name: str | None, directory: str) -> None:
         click.echo("\n".join(f"{scene:16}{_summary(path)}" for scene, path in scenes.items()))
         return
     if name not in scenes:
-        message = f"{name} is no shipped scene{did_you_mean(name, scenes)}; `taichi-msm example` lists them"
+        message = f"{name} is not a shipped scene{did_you_mean(name, scenes)}; `taichi-msm example` lists them"
         raise click.BadParameter(message, param_hint="NAME")
     targets = {path: Path(directory) / path.relative_to(shipped) for path in _files(scenes[name])}
     for path, target in targets.items():

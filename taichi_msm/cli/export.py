@@ -6,7 +6,7 @@ from functools import partial
 
 import click
 
-from taichi_msm.cli import options, session
+from taichi_msm.cli import common, options
 from taichi_msm.errors import printable
 from taichi_msm.exports.formats import FORMATS
 
@@ -33,15 +33,15 @@ def export(
     directories: tuple[str, ...], name: str, out: str | None, camera: str | None, quiet: bool, as_json: bool
 ) -> None:
     """Convert the results of runs and sweeps, each in a DIR, to the formats of other programs."""
-    runs = [session.result_directory(directory, option="DIR") for directory in directories]
-    folder = None if out is None else session.result_directory(out)
+    runs = [common.result_directory(directory, option="DIR") for directory in directories]
+    folder = None if out is None else common.result_directory(out)
 
     from taichi_msm.exports import export as export_module
 
-    with session.interruptible(as_json, quiet) as progress:
+    with common.interruptible(as_json, quiet) as progress:
         exported = export_module.export(runs, name, folder, partial(progress, "export"), camera)
     if as_json:
-        session.print_json(
+        common.print_json(
             {"directory": str(exported.directory), "format": name, "files": exported.files, "notes": exported.notes}
         )
     elif not quiet:

@@ -7,7 +7,7 @@ from typing import Any
 
 import click
 
-from taichi_msm.cli import options, session
+from taichi_msm.cli import common, options
 from taichi_msm.errors import DivergedError, printable
 
 
@@ -15,8 +15,8 @@ from taichi_msm.errors import DivergedError, printable
 @options.scene_argument
 @click.argument("observed", metavar="OBSERVED")
 @click.argument("more", metavar="", nargs=-1)
-@click.option("--free", metavar="KEY ...", multiple=True, help="Numbers of the scene that are fitted, by dotted path.")
-@click.option("--bounds", metavar="KEY=LOW,HIGH ...", multiple=True, help="Smallest and largest value of a number.")
+@click.option("--free", metavar="KEY ...", multiple=True, help="Fitted parameters of the scene, by dotted path.")
+@click.option("--bounds", metavar="KEY=LOW,HIGH ...", multiple=True, help="Smallest and largest value of a parameter.")
 @options.set_option
 @click.option(
     "--forces",
@@ -24,13 +24,13 @@ from taichi_msm.errors import DivergedError, printable
     help="Measured forces of the tools, as in forces.csv, and their standard deviation [N].",
 )
 @click.option("--sigma", type=float, metavar="SIGMA", help="Standard deviation of the observations [m] or [px].")
-@click.option("--robust", is_flag=True, help="Let numbers that are far off count less.")
+@click.option("--robust", is_flag=True, help="Reduce the weight of outliers.")
 @click.option(
-    "--correlation", type=float, metavar="PX", help="How far apart in the picture errors of tracks are alike [px]."
+    "--correlation", type=float, metavar="PX", help="Correlation length of the errors of tracks in the picture [px]."
 )
-@click.option("--drift", type=float, metavar="SECONDS", help="How long errors of one track are alike [s].")
-@click.option("--profile", is_flag=True, help="Find intervals by going to their ends; takes more runs.")
-@click.option("--resolution", type=int, metavar="R", help="Fields along a side of a map that is fitted.")
+@click.option("--drift", type=float, metavar="SECONDS", help="Correlation time of the errors of a track [s].")
+@click.option("--profile", is_flag=True, help="Compute intervals by profile likelihood; takes more runs.")
+@click.option("--resolution", type=int, metavar="R", help="Cells along a side of a fitted map.")
 @click.option("--columns", metavar="NAME=COLUMN", multiple=True, help='Of tables: a column, as "depth=Traverse, mm".')
 @click.option("--sheet", metavar="SHEET", help="Of tables: sheet of a workbook.")
 @click.option("--block", type=int, metavar="N", help="Of tables: block of rows in a file, from 1.")
@@ -72,12 +72,12 @@ def fit(
             raise click.BadParameter(f"{key}: given twice; leave one of them out", param_hint="--bounds")
         limits[key] = interval
     loaded = load_scene(scene, overrides)
-    directory = session.result_directory(out, f"{Path(scene).stem}-fit")
+    directory = common.result_directory(out, f"{Path(scene).stem}-fit")
 
     from taichi_msm.fitting.fit import fit as fit_scene
 
     try:
-        with session.interruptible(as_json) as progress:
+        with common.interruptible(as_json) as progress:
             result = fit_scene(
                 loaded,
                 tables if len(tables) > 1 else observed,
@@ -90,17 +90,17 @@ def fit(
                 **settings,
             )
     except DivergedError as error:
-        session.report_failure("diverged", [f"{scene}: where the search begins: {error}"], as_json)
-        return session.DIVERGED
+        common.report_failure("diverged", [f"{scene}: where the search begins: {error}"], as_json)
+        return common.DIVERGED
     if as_json:
-        session.print_json({"directory": str(directory), **result.as_json()})
+        common.print_json({"directory": str(directory), **result.as_json()})
     else:
         click.echo("\n".join(map(printable, [f"{directory}: fit of {', '.join(tables)}", *result.summary()])))
-    return session.DONE
+    return common.DONE
 
 
 def parse_bounds(text: str) -> tuple[str, tuple[float, float]]:
-    """Parse KEY=LOW,HIGH; a missing bound is infinite."""
+    """Parse KEY=LOW,HIGH, where a missing bound is infinite."""
     try:
         key, interval = text.split("=", 1)
         low, high = interval.split(",", 1)

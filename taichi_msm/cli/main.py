@@ -9,7 +9,7 @@ from pathlib import Path
 
 import click
 
-from taichi_msm.cli import example, export, fit, options, run, session, study, sweep  # noqa: F401  # each registers its commands
+from taichi_msm.cli import common, example, export, fit, options, run, study, sweep  # noqa: F401  # each registers its commands
 from taichi_msm.errors import DivergedError, FilesError, MsmError, SceneError
 from taichi_msm.system.process import discard_buffer, write_stderr
 
@@ -17,13 +17,13 @@ from taichi_msm.system.process import discard_buffer, write_stderr
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run a command, by default that of sys.argv, and return its exit code.
 
-    The codes are those of session.py, 130 after Ctrl-C and 143 after SIGTERM.
+    The codes are those of common.py, 130 after Ctrl-C and 143 after SIGTERM.
     """
     words = list(sys.argv[1:] if arguments is None else arguments)
     try:
         code, lines = _run(words)
         if lines:
-            session.report_failure("error", lines, "--json" in words)
+            common.report_failure("error", lines, "--json" in words)
         return code
     except OSError as error:
         # The reader of stdout has exited, or its disk is full.
@@ -31,7 +31,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         if not isinstance(error, BrokenPipeError):
             name = f" {error.filename}" if error.filename else ""
             write_stderr([f"taichi-msm: cannot read or write{name}: {error.strerror or error}"])
-        return session.FILES
+        return common.FILES
 
 
 def _run(words: list[str]) -> tuple[int, Sequence[str]]:
@@ -39,32 +39,32 @@ def _run(words: list[str]) -> tuple[int, Sequence[str]]:
     try:
         Path.cwd()
     except OSError:
-        return session.FILES, ["taichi-msm: the current folder is gone; change to another"]
+        return common.FILES, ["taichi-msm: the current folder is gone; change to another"]
     try:
-        return int(options.program.main(words, prog_name="taichi-msm", standalone_mode=False) or session.DONE), ()
+        return int(options.program.main(words, prog_name="taichi-msm", standalone_mode=False) or common.DONE), ()
     except SystemExit:
         # click exits like this when the reader of stdout has exited.
         raise BrokenPipeError from None
     except SceneError as error:
-        return session.INVALID_INPUT, error.lines
+        return common.INVALID_INPUT, error.lines
     except FilesError as error:
-        return session.FILES, [str(error)]
+        return common.FILES, [str(error)]
     except DivergedError as error:
-        return session.DIVERGED, [str(error)]
+        return common.DIVERGED, [str(error)]
     except MsmError as error:
-        return session.INVALID_INPUT, [str(error)]
+        return common.INVALID_INPUT, [str(error)]
     except click.exceptions.NoArgsIsHelpError as error:
         click.echo(error.format_message())
-        return session.INVALID_INPUT, ()
+        return common.INVALID_INPUT, ()
     except click.ClickException as error:
         message = " ".join(error.format_message().split())
         if "--set" in words and "unexpected extra argument" in message:
             message = f'{message.rstrip(".")}; a value with blanks needs quotes: --set "KEY=VALUE"'
-        return session.INVALID_INPUT, [f"taichi-msm: {message} (see taichi-msm --help)"]
+        return common.INVALID_INPUT, [f"taichi-msm: {message} (see taichi-msm --help)"]
     except OSError:
         raise
     except Exception as error:
         if os.environ.get("TAICHI_MSM_TRACEBACK"):
             raise
         message = f"a bug: {type(error).__name__}: {' '.join(str(error).split())}"
-        return session.BUG, [f"taichi-msm: {message}; please report it with what TAICHI_MSM_TRACEBACK=1 prints"]
+        return common.BUG, [f"taichi-msm: {message}; please report it with what TAICHI_MSM_TRACEBACK=1 prints"]

@@ -16,7 +16,19 @@ class SuggestingChoice(click.Choice):  # type: ignore[type-arg]  # not generic b
     """Option type with a fixed set of words; errors suggest the nearest one."""
 
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> str:
-        """Validate a word, as `click.ParamType.convert`."""
+        """Validate a word; see `click.ParamType.convert`.
+
+        Args:
+            value: the word.
+            param: the option, for messages.
+            ctx: of the command, for messages.
+
+        Returns:
+            The word.
+
+        Raises:
+            click.BadParameter: when the word is not in the set; suggests the nearest one.
+        """
         try:
             return str(super().convert(value, param, ctx))
         except click.BadParameter as error:
@@ -28,7 +40,7 @@ def parse_shard(text: str) -> tuple[int, int]:
     """Parse I/N, part I of N counted from 1."""
     numbers = re.fullmatch("([0-9]{1,9})/([0-9]{1,9})", text)
     if numbers is None or not 1 <= int(numbers[1]) <= int(numbers[2]):
-        raise click.BadParameter(f"{text} is no part; take I/N with 1 <= I <= N, such as 3/8")
+        raise click.BadParameter(f"{text} is not a part; take I/N with 1 <= I <= N, such as 3/8")
     return int(numbers[1]), int(numbers[2])
 
 
@@ -57,7 +69,7 @@ workers_option = partial(click.option, "--workers", type=click.IntRange(1, MAX_W
 json_option = click.option("--json", "as_json", is_flag=True, help="Print one JSON object on stdout and nothing else.")
 
 
-def print_version(context: click.Context, _option: click.Parameter, requested: bool) -> None:
+def _print_version(context: click.Context, _option: click.Parameter, requested: bool) -> None:
     """Print the versions of the program and of its compiler, and exit; a callback of click."""
     if requested:
         from taichi_msm.system.compiler import active_compiler
@@ -69,7 +81,7 @@ def print_version(context: click.Context, _option: click.Parameter, requested: b
 
 @click.group(context_settings={"help_option_names": ["-h", "--help"]})
 @click.option(
-    "--version", is_flag=True, is_eager=True, expose_value=False, callback=print_version, help="Print the versions."
+    "--version", is_flag=True, is_eager=True, expose_value=False, callback=_print_version, help="Print the versions."
 )
 def program() -> None:
     """Deform an image as tissue deforms."""

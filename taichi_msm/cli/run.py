@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from taichi_msm.cli import START_TIME, options, session
+from taichi_msm.cli import START_TIME, common, options
 from taichi_msm.system.process import Interruption, write_stderr
 
 if TYPE_CHECKING:
@@ -58,8 +58,8 @@ def run(
     typed = [*overrides, *([f"image={image}"] if image is not None else [])]
     if resume is not None:
         _require_no_settings(context, "--resume continues", ("resume", "threads", "quiet", "as_json"))
-        directory = session.result_directory(resume, option="--resume")
-        if not session.resume_hint(directory):
+        directory = common.result_directory(resume, option="--resume")
+        if not common.resume_hint(directory):
             raise click.BadParameter(f"there is no unfinished run in {resume}", param_hint="--resume")
     elif again is not None:
         allowed = ("again", "out", "arch", "threads", "estimate_error", "quiet", "as_json")
@@ -67,29 +67,29 @@ def run(
         from taichi_msm.load.check import check_scene
         from taichi_msm.runs.finished import read_run
 
-        directory = session.result_directory(again, option="--again")
+        directory = common.result_directory(again, option="--again")
         earlier = read_run(directory)
         earlier.require_same_pictures(drawn=earlier.scene.draws or "image" in earlier.sha256)
         plan, typed = check_scene(earlier.scene), earlier.overrides
-        directory = directory if out is None else session.result_directory(out)
+        directory = directory if out is None else common.result_directory(out)
     elif scene is None:
         raise click.MissingParameter(param_hint="'SCENE'", param_type="argument")
     else:
         from taichi_msm.load.scene_file import load_plan
 
         plan = load_plan(scene, overrides, image)
-        directory = session.result_directory(out, Path(scene).stem)
+        directory = common.result_directory(out, Path(scene).stem)
 
     from taichi_msm.cli.console import run_summary
     from taichi_msm.runs import run as run_module
 
     interruption, name = Interruption(), str(scene or resume or again)
     with (
-        session.interruptible(
-            as_json, quiet, interruption, lambda: f"; nothing was written{session.resume_hint(directory)}"
+        common.interruptible(
+            as_json, quiet, interruption, lambda: f"; nothing was written{common.resume_hint(directory)}"
         ) as progress,
-        session.add_resume_hint(directory),
-        session.prefix_errors(name),
+        common.add_resume_hint(directory),
+        common.prefix_errors(name),
     ):
         if resume is not None:
             record = run_module.resume(directory, threads=threads, started=START_TIME, progress=progress)
@@ -105,14 +105,14 @@ def run(
                 progress=progress,
             )
     if as_json:
-        session.print_json({"directory": str(directory), **record})
+        common.print_json({"directory": str(directory), **record})
     if record["status"] != "complete":
         message = f"{name}: {record.get('error', 'interrupted')}; frames in {directory}: {record['frames']}"
-        remedy = f"; last good state: {record['dump']}" if record.get("dump") else session.resume_hint(directory)
+        remedy = f"; last good state: {record['dump']}" if record.get("dump") else common.resume_hint(directory)
         write_stderr([message + remedy])
     elif not quiet and not as_json:
         click.echo(run_summary(record, directory))
-    return session.EXIT_CODES.get(record["status"], interruption.code)
+    return common.EXIT_CODES.get(record["status"], interruption.code)
 
 
 def _require_no_settings(context: click.Context, action: str, allowed: Sequence[str]) -> None:
@@ -139,7 +139,7 @@ def check(scene: str, image: str | None, overrides: tuple[str, ...], as_json: bo
     from taichi_msm.render.texture import load_texture
 
     plan = load_plan(scene, overrides, image)
-    with session.prefix_errors(scene):
+    with common.prefix_errors(scene):
         cost.require_disk(plan, Path("output"))
         if plan.scene.draws:
             load_texture(plan.scene)
@@ -170,7 +170,7 @@ def check(scene: str, image: str | None, overrides: tuple[str, ...], as_json: bo
         ],
     }
     if as_json:
-        session.print_json(report)
+        common.print_json(report)
         return
     import yaml
 
@@ -213,4 +213,4 @@ def schema() -> None:
     """Print the JSON Schema of a scene, for editors."""
     from taichi_msm.load.scene_file import schema
 
-    session.print_json(schema())
+    common.print_json(schema())

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from taichi_msm.cli import options, session
+from taichi_msm.cli import common, options
 from taichi_msm.errors import FilesError, NotInstalledError, printable
 from taichi_msm.runs.directory import require_no_link
 from taichi_msm.system.process import Interruption, write_stderr
@@ -34,7 +34,7 @@ if TYPE_CHECKING:
     metavar="ERROR",
     help="Largest error, as a fraction of the largest displacement.  [default: the scene's, or 1e-3]",
 )
-@click.option("--quick", is_flag=True, help="Take a minute instead of several: fewer and shorter measurements.")
+@click.option("--quick", is_flag=True, help="Make fewer and shorter measurements, in a minute instead of several.")
 @options.json_option
 def study(
     scene: str,
@@ -50,7 +50,7 @@ def study(
     from taichi_msm.scene.section import MAX_TOLERANCE, MIN_TOLERANCE
 
     loaded = load_scene(scene, overrides, image)
-    directory = session.result_directory(out, f"{Path(scene).stem}-study")
+    directory = common.result_directory(out, f"{Path(scene).stem}-study")
     if tolerance is not None and not MIN_TOLERANCE <= tolerance <= MAX_TOLERANCE:
         expected = f"expected a number, {MIN_TOLERANCE:g} to {MAX_TOLERANCE:g}"
         raise click.BadParameter(f"{tolerance:g} is not allowed; {expected}", param_hint="--tolerance")
@@ -60,7 +60,7 @@ def study(
 
     require_writable(directory)
     interruption = Interruption()
-    with session.interruptible(as_json, interruption=interruption) as progress, session.prefix_errors(scene):
+    with common.interruptible(as_json, interruption=interruption) as progress, common.prefix_errors(scene):
         results = run_study(loaded, Path(scene).stem, tolerance=tolerance, progress=progress, **settings)
         if not results.stepping:
             raise KeyboardInterrupt
@@ -69,11 +69,11 @@ def study(
         directory = require_no_link(directory / "interrupted", "--out")
     outputs = write_report(results, directory)
     if as_json:
-        session.print_json({"directory": str(directory), **study_record(results), "outputs": outputs})
+        common.print_json({"directory": str(directory), **study_record(results), "outputs": outputs})
     else:
         click.echo(format_summary(results))
         click.echo(printable(f"{directory}: {', '.join(outputs)}"))
-    return session.EXIT_CODES.get(results.status, interruption.code)
+    return common.EXIT_CODES.get(results.status, interruption.code)
 
 
 @options.program.command()
@@ -102,7 +102,7 @@ def study(
     "--seconds",
     type=click.FloatRange(min=0, max=3600, min_open=True),
     metavar="N",
-    help="With --record: film so long, without a page.",
+    help="With --record: duration of the film [s], which is recorded without a page.",
 )
 @click.option("--script", metavar="EVENTS", help="With --seconds: events of the film, a YAML file.")
 def view(
@@ -133,7 +133,7 @@ def view(
     film = None if record is None else _film_path(record)
     permitted = [_require_origin(origin) for origin in origins]
     loaded = load_scene(scene, overrides, image)
-    directory = session.result_directory(out, f"{Path(scene).stem}-live")
+    directory = common.result_directory(out, f"{Path(scene).stem}-live")
 
     from taichi_msm.render.notes import drawing_warnings
     from taichi_msm.view.script import load_script, record_film, schedule_events
@@ -148,22 +148,22 @@ def view(
     notices: list[str] = []
 
     def begin() -> Session:
-        with session.show_progress(interruption, quiet=False) as progress:
+        with common.show_progress(interruption, quiet=False) as progress:
             return Session(loaded, captures, arch, threads, play=play, progress=lambda stage: progress(stage, 0, 0))
 
     try:
         with (
-            session.report_interruption(interruption, False, lambda: "; no film was written" if seconds else ""),
-            session.prefix_errors(scene),
+            common.report_interruption(interruption, False, lambda: "; no film was written" if seconds else ""),
+            common.prefix_errors(scene),
         ):
             if film is None or seconds is None:
                 _serve(begin, scene, port, permitted, film, interruption)
-                return session.DONE
-            with begin() as live, session.show_progress(interruption, quiet=False) as progress:
+                return common.DONE
+            with begin() as live, common.show_progress(interruption, quiet=False) as progress:
                 events = schedule_events(loaded_script, live.frame_rate, loaded.render.size) if loaded_script else ()
                 record_film(live, film, seconds, events, partial(progress, "film"), notices.append)
             click.echo(printable(str(film)))
-            return session.DIVERGED if live.divergence_error else session.DONE
+            return common.DIVERGED if live.divergence_error else common.DONE
     finally:
         write_stderr(notices)
         for path in captures.saved:

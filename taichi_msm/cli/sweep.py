@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import click
 
-from taichi_msm.cli import options, session
+from taichi_msm.cli import common, options
 from taichi_msm.errors import LostExecutorError, printable
 from taichi_msm.system.process import write_stderr
 
@@ -22,13 +22,13 @@ MAX_UNCONFIRMED_RUNS = 10_000
 @options.program.command()
 @click.argument("file", metavar="SWEEP")
 @click.option("--out", metavar="DIR", help="Directory for the runs.  [default: output/<name of the sweep file>]")
-@options.workers_option(help="Processes that take the runs.  [default: one for each core, as far as memory goes]")
-@click.option("--dask", metavar="ADDRESS", help="Let the workers of a dask scheduler take the runs.")
+@options.workers_option(help="Number of worker processes.  [default: one per core, limited by the memory]")
+@click.option("--dask", metavar="ADDRESS", help="Execute the runs in the workers of a dask scheduler.")
 @click.option(
-    "--shard", type=options.parse_shard, metavar="I/N", help="Take only part I of N of the runs; write no table."
+    "--shard", type=options.parse_shard, metavar="I/N", help="Execute only part I of N of the runs; write no table."
 )
 @click.option("--dry-run", is_flag=True, help="Print the values of all runs and their cost; run nothing.")
-@click.option("--yes", is_flag=True, help=f"Take more than {MAX_UNCONFIRMED_RUNS} runs, or longer than a day.")
+@click.option("--yes", is_flag=True, help=f"Permit more than {MAX_UNCONFIRMED_RUNS} runs, or more than a day.")
 @options.json_option
 def sweep(
     file: str,
@@ -40,7 +40,7 @@ def sweep(
     yes: bool,
     as_json: bool,
 ) -> int:
-    """Run a scene many times with varied values, as SWEEP says, and write a table of the results."""
+    """Run a scene with every set of values of SWEEP, and write a table of the results."""
     from taichi_msm.sweeps.runs import begin_sweep, run_missing
     from taichi_msm.sweeps.spec import load_sweep
     from taichi_msm.sweeps.sweep import finish_sweep, open_executor
@@ -49,12 +49,12 @@ def sweep(
     if workers is not None and dask is not None:
         raise click.UsageError("--workers are processes here, and --dask has its own; leave out one of them")
     loaded = load_sweep(file)
-    directory = session.result_directory(out, Path(file).stem)
+    directory = common.result_directory(out, Path(file).stem)
     cost = estimate_cost(loaded)
     chosen = choose_worker_count(cost, loaded.runs, workers)
     if dry_run:
-        print_dry_run(loaded, cost, shard or (1, 1), workers, as_json)
-        return session.DONE
+        _print_dry_run(loaded, cost, shard or (1, 1), workers, as_json)
+        return common.DONE
     if not yes and (loaded.runs > MAX_UNCONFIRMED_RUNS or cost.seconds > 86400):
         raise click.UsageError(f"{cost_line(loaded.runs, cost, chosen)}; add --yes if that is meant")
     state = begin_sweep(loaded, directory, shard or (1, 1))
@@ -69,7 +69,7 @@ def sweep(
     notes: list[str] = []
     try:
         with (
-            session.interruptible(as_json, rest=lambda: f"; {progress_message(len(outcomes), total)}") as progress,
+            common.interruptible(as_json, rest=lambda: f"; {_progress_message(len(outcomes), total)}") as progress,
             # Only runs need a cluster.
             open_executor(dask if missing else None, chosen.number, state, progress) as executor,
         ):
@@ -78,19 +78,19 @@ def sweep(
             if shard is None:
                 files, notes = finish_sweep(state, executor, progress)
     except LostExecutorError as error:
-        session.report_failure("error", [f"{error}; {progress_message(len(outcomes), total)}"], as_json)
-        return session.FILES
+        common.report_failure("error", [f"{error}; {_progress_message(len(outcomes), total)}"], as_json)
+        return common.FILES
     if as_json:
         counts = count_statuses(outcomes)
-        session.print_json(
+        common.print_json(
             {"directory": str(directory), "runs": len(outcomes), **counts, "outputs": files, "notes": notes}
         )
     else:
         click.echo("\n".join(map(printable, summary_lines(directory, outcomes, shard, files, notes))))
-    return session.DONE
+    return common.DONE
 
 
-def print_dry_run(loaded: Sweep, cost: SweepCost, shard: tuple[int, int], workers: int | None, as_json: bool) -> None:
+def _print_dry_run(loaded: Sweep, cost: SweepCost, shard: tuple[int, int], workers: int | None, as_json: bool) -> None:
     """Print the values of the runs of a shard, and their part of the cost of the sweep, as a table or as JSON."""
     from taichi_msm.sweeps.spec import format_override
     from taichi_msm.sweeps.tables import choose_worker_count, cost_line, csv_line
@@ -101,7 +101,7 @@ def print_dry_run(loaded: Sweep, cost: SweepCost, shard: tuple[int, int], worker
     chosen = choose_worker_count(cost, len(runs), workers)
     if as_json:
         rows = {"keys": loaded.keys, "runs": list(runs), "values": [values[run] for run in runs]}
-        session.print_json({**rows, **cost._asdict(), "workers": chosen.number})
+        common.print_json({**rows, **cost._asdict(), "workers": chosen.number})
         return
     click.echo(csv_line(["run", *loaded.keys]))
     for run in runs:
@@ -109,6 +109,6 @@ def print_dry_run(loaded: Sweep, cost: SweepCost, shard: tuple[int, int], worker
     click.echo(cost_line(len(runs), cost, chosen))
 
 
-def progress_message(done: int, total: int) -> str:
+def _progress_message(done: int, total: int) -> str:
     """Format the progress of an unfinished sweep."""
     return f"{done} of {total} runs have ended; the same command goes on"

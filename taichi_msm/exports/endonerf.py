@@ -1,7 +1,7 @@
 """EndoNeRF export: pictures, depth, masks and poses for neural reconstruction of deforming tissue.
 
     images/000000.png   frames, RGB
-    depth/000000.png    depth along the optical axis, 16 bits; 0: background
+    depth/000000.png    depth along the optical axis, 16 bits; 0 on the background
     masks/000000.png    255 where an instrument is visible, else 0
     poses_bounds.npy    a row per frame, float64: the matrix [right, up, backward, eye, (height, width, focal length)],
                         shape (3, 5), row by row, from the camera to the world; least and largest depth of the frame
@@ -38,9 +38,8 @@ MIN_UNIT_M, MAX_VALUE = 1e-5, 65535
 LOADER_SIZE = (640, 512)
 
 
-@one_folder_per_run
-def write(run: FinishedRun, folder: Path, progress: ProgressCallback) -> list[str]:
-    """Write the frames, depths, masks and poses of a run; arguments as for `one_folder_per_run`."""
+def _write_run(run: FinishedRun, folder: Path, progress: ProgressCallback) -> list[str]:
+    """Write the frames, depths, masks and poses of a run."""
     camera, size = read_pinhole(run, FORMAT_NAME), run.scene.render.size
     _require_central(camera, size, run)
     for name in ("images", "depth", "masks"):
@@ -71,6 +70,9 @@ def write(run: FinishedRun, folder: Path, progress: ProgressCallback) -> list[st
         share = f"up to {100 * background:.2g} % of the pixels of a frame are background, depth 0"
         notes.append(f"{share}: EndoGaussian leaves them out, EndoNeRF does not; fill the picture with the sheet")
     return notes
+
+
+write = one_folder_per_run(_write_run)
 
 
 def _require_central(camera: Pinhole, size: tuple[int, int], run: FinishedRun) -> None:

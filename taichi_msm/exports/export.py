@@ -109,7 +109,7 @@ def export(
     exported = _write_export(views, format, directory, progress)
     if incomplete:
         count = f"{incomplete} of {incomplete + len(finished)} runs"
-        exported.notes.insert(0, f"left out, as not complete: {count}; the sweep's table.csv has the reasons")
+        exported.notes.insert(0, f"incomplete, and left out: {count}; the sweep's table.csv has the reasons")
     return exported
 
 

@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Iterator, Sequence
-from functools import wraps
+from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import NamedTuple
+from typing import NamedTuple, Protocol
 
 from taichi_msm.errors import FilesError, ProgressCallback
 from taichi_msm.runs.directory import MAX_RECORD_BYTES, list_files
@@ -112,21 +111,46 @@ class ExportSource(NamedTuple):
     progress: ProgressCallback  # called with the finished and total frames of this run
 
 
-# Generator that writes all runs to an empty folder: yields the warnings about each run in turn, and finally writes the
-# files that combine runs. It raises a FilesError for results that are missing or damaged or do not suit the format, a
-# SceneError for a picture that has changed since the run, an ArgumentError for a camera that the format cannot
-# describe, and a NotInstalledError for a missing package.
-FormatWriter = Callable[[Sequence[ExportSource], Path], Iterator[list[str]]]
+class FormatWriter(Protocol):
+    """Function `write` of a format."""
+
+    def __call__(self, sources: Sequence[ExportSource], folder: Path, /) -> Iterator[list[str]]:
+        """Write all runs.
+
+        Args:
+            sources: runs to export.
+            folder: existing, empty folder of the export.
+
+        Yields:
+            Warnings about each run in turn. Files that combine runs are written after the last one.
+
+        Raises:
+            FilesError: when results are missing or damaged or do not suit the format.
+            SceneError: when a picture has changed since the run.
+            ArgumentError: when the format cannot describe the camera.
+            NotInstalledError: when a package is missing.
+        """
 
 
-# Function that writes a run to a path, given with its progress, and returns warnings.
-RunWriter = Callable[[FinishedRun, Path, ProgressCallback], list[str]]
+class RunWriter(Protocol):
+    """Function that writes the files of a single run."""
+
+    def __call__(self, run: FinishedRun, path: Path, progress: ProgressCallback, /) -> list[str]:
+        """Write a run and return warnings.
+
+        Args:
+            run: run to export, with the first of the format's cameras selected.
+            path: existing folder of the run's files, or the file or folder to create.
+            progress: called with the finished and the total number of frames.
+
+        Raises:
+            FilesError, SceneError, ArgumentError, NotInstalledError: as for `FormatWriter`.
+        """
 
 
 def one_folder_per_run(write: RunWriter) -> FormatWriter:
-    """Decorate a function that writes a run to an existing folder, which is that of the export for a single run."""
+    """Return the writer of a format with a folder for each run, or the folder of the export for a single run."""
 
-    @wraps(write)
     def write_all(sources: Sequence[ExportSource], folder: Path) -> Iterator[list[str]]:
         for run, name, progress in sources:
             (folder / name).mkdir(exist_ok=True)
@@ -135,18 +159,19 @@ def one_folder_per_run(write: RunWriter) -> FormatWriter:
     return write_all
 
 
-def one_path_per_run(suffix: str = "") -> Callable[[RunWriter], FormatWriter]:
-    """Decorate a function that writes a run to a file or folder named by its number and the suffix."""
+def one_path_per_run(write: RunWriter, suffix: str = "") -> FormatWriter:
+    """Return the writer of a format with a file or folder for each run.
 
-    def decorate(write: RunWriter) -> FormatWriter:
-        @wraps(write)
-        def write_all(sources: Sequence[ExportSource], folder: Path) -> Iterator[list[str]]:
-            for run, name, progress in sources:
-                yield write(run, folder / f"{name or zero_padded(0)}{suffix}", progress)
+    Args:
+        write: function that creates the file or folder of a run.
+        suffix: suffix of its name, after the number of the run.
+    """
 
-        return write_all
+    def write_all(sources: Sequence[ExportSource], folder: Path) -> Iterator[list[str]]:
+        for run, name, progress in sources:
+            yield write(run, folder / f"{name or zero_padded(0)}{suffix}", progress)
 
-    return decorate
+    return write_all
 
 
 def read_runs(directories: Sequence[str | Path]) -> tuple[list[FinishedRun], int]:
@@ -156,7 +181,7 @@ def read_runs(directories: Sequence[str | Path]) -> tuple[list[FinishedRun], int
         The runs, only complete ones of sweeps; and the number of incomplete runs.
 
     Raises:
-        FilesError: as for `read_run`, and when there is no run.
+        FilesError: as for `read_run`, and when no run is complete.
     """
     runs, incomplete = [], 0
     for directory in map(Path, directories):

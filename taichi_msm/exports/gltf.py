@@ -53,9 +53,8 @@ Array = NDArray[np.floating]
 Numbers = NDArray[Any]
 
 
-@one_folder_per_run
-def write(run: FinishedRun, folder: Path, progress: ProgressCallback) -> list[str]:
-    """Write the animated surface with its picture, the tools and cameras; arguments as for `one_folder_per_run`."""
+def _write_run(run: FinishedRun, folder: Path, progress: ProgressCallback) -> list[str]:
+    """Write the animated surface with its picture, the tools and cameras."""
     positions, picture = run.positions(), picture_png(run)
     # Differences of position and normal, float32.
     target_bytes = 2 * 3 * 4 * positions[0, ..., 0].size
@@ -71,10 +70,13 @@ def write(run: FinishedRun, folder: Path, progress: ProgressCallback) -> list[st
         file.writelines(glb.content())
     if len(keys.frames) < run.frames:
         notes.append(
-            f"{len(keys.frames)} of {run.frames} frames are key frames; between them no point is farther than "
-            f"{keys.error:.2g} m from where it was"
+            f"{len(keys.frames)} of {run.frames} frames are keyframes; the interpolation error between them is at most "
+            f"{keys.error:.2g} m"
         )
     return notes
+
+
+write = one_folder_per_run(_write_run)
 
 
 def _add_sheet(
@@ -142,7 +144,7 @@ def _add_cameras(glb: Glb, run: FinishedRun) -> list[str]:
             field = {"xmag": width / 2, "ymag": height / 2, "znear": 0.0, "zfar": 2 * view.distance}
             optics = {"type": "orthographic", "orthographic": field}
         if view.lens is not None or not np.allclose(view.centre, view.size / 2):
-            notes.append(f"{title}: without its distortion and its principal point, which a camera of glTF cannot have")
+            notes.append(f"{title}: without lens distortion and principal point, which glTF cameras do not have")
         camera = glb.add("cameras", {"name": title, **optics})
         pose = {
             "translation": np.array([view.eye for view in views]),
@@ -178,6 +180,9 @@ def key_frames(position: Array, limit: int, progress: ProgressCallback = lambda 
         position: positions at equidistant times [m], shape (frames, rows, cols, 3).
         limit: maximum number of keyframes, 2 or more.
         progress: called with the chosen and the maximum number of keyframes.
+
+    Returns:
+        Keyframes, and the largest interpolation error [m].
 
     Source: Douglas and Peucker 1973, applied to all mass points at once, with a number instead of a tolerance.
     """
@@ -270,23 +275,40 @@ class Glb:
         return len(self._accessors) - 1
 
     def attributes(self, positions: Numbers, normals: Numbers) -> dict[str, int]:
-        """Append the vertices of a mesh, or their changes, both of shape (vertices, 3)."""
+        """Return the attributes of a mesh or of a morph target, after appending them.
+
+        Args:
+            positions: positions of the vertices, or their differences [m], shape (vertices, 3).
+            normals: unit normals, or their differences, shape (vertices, 3).
+        """
         return {
             "POSITION": self.accessor(positions, GL_ARRAY_BUFFER, bounds=True),
             "NORMAL": self.accessor(normals, GL_ARRAY_BUFFER),
         }
 
     def indices(self, triangles: Numbers) -> int:
-        """Append the vertices of triangles, shape (triangles, 3)."""
+        """Append the vertex indices of triangles, shape (triangles, 3); return the index of the accessor."""
         return self.accessor(triangles.reshape(-1), GL_ELEMENT_ARRAY_BUFFER)
 
     def add(self, kind: str, entry: dict[str, Any]) -> int:
-        """Append an entry to a list of the document, such as "nodes"; return its index."""
+        """Return the index of an entry, after appending it to the document.
+
+        Args:
+            kind: name of the list, such as "nodes".
+            entry: content of the entry.
+        """
         self.document.setdefault(kind, []).append(entry)
         return len(self.document[kind]) - 1
 
     def animate(self, node: int, path: str, times: Numbers, values: Numbers) -> None:
-        """Append the values of a property of a node at times [s], with linear interpolation."""
+        """Append a channel of the animation, with linear interpolation.
+
+        Args:
+            node: index of the node.
+            path: property of the node: translation, rotation or weights.
+            times: times of the values [s], shape (n,).
+            values: values of the property in glTF's units, shape (n, k), or (n * targets,) of weights.
+        """
         if "animations" not in self.document:
             self.add("animations", {"name": "motion", "samplers": [], "channels": []})
         (animation,) = self.document["animations"]

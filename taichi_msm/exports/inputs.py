@@ -46,7 +46,13 @@ def picture_png(run: FinishedRun) -> bytes | None:
 
 
 def encode_picture(picture: NDArray[np.uint8] | NDArray[np.uint16], format: str, **options: int) -> bytes:  # noqa: A002
-    """Encode a picture in a format of Pillow, with its options."""
+    """Return the bytes of a picture file.
+
+    Args:
+        picture: grey values or colours, shape (height, width) or (height, width, 3).
+        format: format of Pillow, PNG or JPEG.
+        **options: Pillow's options of the format.
+    """
     file = io.BytesIO()
     Image.fromarray(picture).save(file, format, **options)
     return file.getvalue()
@@ -105,7 +111,12 @@ def read_track_positions(run: FinishedRun) -> tuple[NDArray[np.float32], NDArray
 
 
 def read_depth(run: FinishedRun, frame: int) -> NDArray[np.float32]:
-    """Read the depth of a frame along the optical axis [m], shape (height, width); 0: background."""
+    """Return the depth along the optical axis [m], shape (height, width), 0 on the background.
+
+    Args:
+        run: run with depth, and its camera selected.
+        frame: index of the frame.
+    """
     path = run.result_path("depth", frame)
     with reading(path), Image.open(path, formats=["TIFF"]) as image:
         # Before any pixel is decoded.
@@ -118,7 +129,13 @@ def read_depth(run: FinishedRun, frame: int) -> NDArray[np.float32]:
 
 
 def read_picture_file(run: FinishedRun, key: str, frame: int) -> bytes:
-    """Read the file of a picture of an entry of `output`, such as "png", and validate it by decoding it."""
+    """Return the file of a picture, after validating it by decoding.
+
+    Args:
+        run: run with its camera selected.
+        key: entry of `output`, such as png.
+        frame: index of the frame.
+    """
     run.read_picture(key, frame)
     path = run.result_path(key, frame)
     with reading(path):
@@ -151,6 +168,9 @@ def read_pinhole(run: FinishedRun, name: str) -> Pinhole:
         run: the run, with its camera selected.
         name: name of the format, for messages.
 
+    Returns:
+        Intrinsics, and the pose of every frame.
+
     Raises:
         ArgumentError: when the camera is orthographic or has lens distortion.
     """
@@ -163,8 +183,8 @@ def read_pinhole(run: FinishedRun, name: str) -> Pinhole:
         is_distorted = camera.get("model", "pinhole") != "pinhole" or bool(np.any(camera.get("distortion", ())))
         is_pinhole = "intrinsics" in camera
     if not is_pinhole:
-        fault = f"{name} needs a pinhole, and {path} has none"
-        raise ArgumentError(f"{fault}; {another}run the scene with one that has perspective")
+        fault = f"{name} needs a pinhole camera, and that of {path} is not"
+        raise ArgumentError(f"{fault}; {another}run the scene with a pinhole camera")
     if is_distorted:
         fault = f"{path}: the camera has a distortion, which {name} cannot describe"
         raise ArgumentError(f"{fault}; {another}run the scene without it")

@@ -35,7 +35,15 @@ SOURCE_OUTPUTS = {"flow_occ": "flow", "flow_noc": "occlusion", "image_2": "png"}
 
 
 def write(sources: Sequence[ExportSource], folder: Path) -> Iterator[list[str]]:
-    """Write the flow of runs, with pictures and occlusion if available; arguments as for `FormatWriter`."""
+    """Write the flow of runs, with pictures and occlusion if available.
+
+    Args:
+        sources: runs to export.
+        folder: existing, empty folder of the export.
+
+    Yields:
+        Warnings about each run in turn.
+    """
     training, first = folder / "training", 0
     for name in SOURCE_OUTPUTS:
         (training / name).mkdir(parents=True)

@@ -24,9 +24,8 @@ from taichi_msm.runs.finished import FinishedRun
 MATERIAL_FILE = "surface.mtl"
 
 
-@one_folder_per_run
-def write(run: FinishedRun, folder: Path, progress: ProgressCallback) -> list[str]:
-    """Write the surface of every frame, the material and the picture; arguments as for `one_folder_per_run`."""
+def _write_run(run: FinishedRun, folder: Path, progress: ProgressCallback) -> list[str]:
+    """Write the surface of every frame, the material and the picture."""
     positions, picture = run.positions(), picture_png(run)
     if picture is not None:
         write_new_file(folder / PICTURE_FILE, picture)
@@ -46,6 +45,9 @@ def write(run: FinishedRun, folder: Path, progress: ProgressCallback) -> list[st
             file.write(_lines("vn", unit_normals(position)))
             file.write(f"usemtl sheet\n{faces}")
     return []
+
+
+write = one_folder_per_run(_write_run)
 
 
 def _lines(key: str, rows: NDArray[np.floating]) -> str:

@@ -46,9 +46,8 @@ except ImportError:
     raise NotInstalledError("--format rerun: needs rerun-sdk, which is not installed; pip install rerun-sdk") from None
 
 
-@one_path_per_run(".rrd")
-def write(run: FinishedRun, path: Path, progress: ProgressCallback) -> list[str]:
-    """Write a recording of a run; arguments as for `one_path_per_run`."""
+def _write_run(run: FinishedRun, path: Path, progress: ProgressCallback) -> list[str]:
+    """Write a recording of a run."""
     # The viewer merges recordings with the same identity.
     identity = uuid5(NAMESPACE_URL, run.directory.resolve().as_uri())
     with rerun.RecordingStream("taichi_msm", recording_id=identity) as recording:
@@ -64,8 +63,13 @@ def write(run: FinishedRun, path: Path, progress: ProgressCallback) -> list[str]
     missing = [key for key in FORMATS["rerun"].optional_outputs if not any(each.has_output(key) for each in views)]
     notes = [f"without {key}, which is not among the results; {run.remedy(key)}" for key in missing]
     if any(view_at(run.scene, 0.0, each.camera).lens is not None for each in views):
-        notes.append("Rerun has no lens distortion, so that points in space are off in the pictures of a lens")
+        notes.append(
+            "Rerun has no lens distortion, so projected points deviate from the pictures of a distorted camera"
+        )
     return notes
+
+
+write = one_path_per_run(_write_run, ".rrd")
 
 
 def _views(run: FinishedRun) -> dict[str, FinishedRun]:

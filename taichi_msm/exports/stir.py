@@ -51,9 +51,8 @@ ALIGNMENT_TOLERANCE = 1e-6
 Pixels = NDArray[np.int64]
 
 
-@one_path_per_run()
-def write(run: FinishedRun, folder: Path, progress: ProgressCallback) -> list[str]:
-    """Write the videos, marked tracks and cameras of a run; arguments as for `one_path_per_run`."""
+def _write_run(run: FinishedRun, folder: Path, progress: ProgressCallback) -> list[str]:
+    """Write the videos, marked tracks and cameras of a run."""
     if not outputs.is_pyav_installed():
         raise NotInstalledError(f"--format {outputs.PYAV_NOT_INSTALLED.replace('mp4', FORMAT_NAME, 1)}")
     runs = [replace(run, camera=side) for side in CAMERAS]
@@ -73,6 +72,9 @@ def write(run: FinishedRun, folder: Path, progress: ProgressCallback) -> list[st
     return _notes(run.scene.render.size, pixels, tracks, baseline)
 
 
+write = one_path_per_run(_write_run)
+
+
 def _baseline(run: FinishedRun, left: Pinhole, right: Pinhole) -> float:
     """Return the baseline of a rectified stereo pair [m]; raise a FilesError for other cameras."""
     # Transform from the axes of the left camera to those of the right one, in every frame.
@@ -82,7 +84,7 @@ def _baseline(run: FinishedRun, left: Pinhole, right: Pinhole) -> float:
     is_parallel = np.abs(rotation - np.eye(3)).max() < ALIGNMENT_TOLERANCE
     is_horizontal = np.abs(translation - [-baseline, 0.0, 0.0]).max() < ALIGNMENT_TOLERANCE * baseline
     if not (is_parallel and is_horizontal) or (left.focal != right.focal).any():
-        fault = f"{FORMAT_NAME} needs the camera right beside left, to the right of it and just like it"
+        fault = f"{FORMAT_NAME} needs a rectified stereo pair of equal cameras, left and right"
         raise FilesError(f"{run.directory}: {fault}; run the scene with `right: {{beside: left, baseline: 0.005}}`")
     return baseline
 
@@ -146,16 +148,16 @@ def _notes(size: tuple[int, int], pixels: Pixels, tracks: int, baseline: float) 
     notes, marked = [], pixels.shape[2]
     if marked < tracks:
         notes.append(
-            f"{marked} of {tracks} points are marked; the others are hidden from a camera in the first or last frame, "
-            "or too near to the edge or to a marked one"
+            f"{marked} of {tracks} tracks are marked; the others are occluded in the first or last frame of a camera, "
+            "or too close to the edge or to a marked one"
         )
     if size != LOADER_SIZE:
         width, height = LOADER_SIZE
-        notes.append(f"STIR's loader reads films of {width} x {height} pixels only; these have {size[0]} x {size[1]}")
+        notes.append(f"STIR's loader reads videos of {width} x {height} pixels only; these have {size[0]} x {size[1]}")
     disparity = pixels[0, :, :, 0] - pixels[1, :, :, 0]
     if ((disparity < MIN_DISPARITY_PX) | (disparity > MAX_DISPARITY_PX)).any():
         notes.append(
-            f"STIR's loader finds places in space for disparities of {MIN_DISPARITY_PX} to {MAX_DISPARITY_PX} px; "
-            f"here they are {disparity.min()} to {disparity.max()} px with a baseline of {baseline:g} m"
+            f"STIR's loader triangulates disparities of {MIN_DISPARITY_PX} to {MAX_DISPARITY_PX} px only; "
+            f"these are {disparity.min()} to {disparity.max()} px, with a baseline of {baseline:g} m"
         )
     return notes

@@ -31,9 +31,8 @@ from taichi_msm.runs.directory import create_file
 from taichi_msm.runs.finished import FinishedRun
 
 
-@one_path_per_run(".npz")
-def write(run: FinishedRun, path: Path, progress: ProgressCallback) -> list[str]:
-    """Write the tracks and frames of a run; arguments as for `one_path_per_run`."""
+def _write_run(run: FinishedRun, path: Path, progress: ProgressCallback) -> list[str]:
+    """Write the tracks and frames of a run."""
     camera, (pixels, occluded), (_, position) = (
         read_pinhole(run, "tapvid3d"),
         read_tracks(run),
@@ -60,4 +59,7 @@ def write(run: FinishedRun, path: Path, progress: ProgressCallback) -> list[str]
     with create_file(path) as archive:
         write_arrays(archive, arrays)
     tracks, omitted = len(occluded), len(occluded) - int(is_exported.sum())
-    return [f"{omitted} of {tracks} points are left out, as no frame shows them"] if omitted else []
+    return [f"{omitted} of {tracks} tracks are left out, as they are visible in no frame"] if omitted else []
+
+
+write = one_path_per_run(_write_run, ".npz")

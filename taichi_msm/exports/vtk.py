@@ -34,16 +34,14 @@ from taichi_msm.runs.finished import FinishedRun
 from taichi_msm.solver.planning import make_plan
 from taichi_msm.terms.elasticity import energy_density
 
-UNITS = {"displacement": "m", "speed": "m/s", "energy_density": "J/m2"}
 TYPES = {"f": "Float", "i": "Int", "u": "UInt"}
-TRIANGLE = 5  # VTK's number of the kind of a cell
+UNITS = {"displacement": "m", "speed": "m/s", "energy_density": "J/m2"}
 
 Array = NDArray[np.floating]
 
 
-@one_folder_per_run
-def write(run: FinishedRun, folder: Path, progress: ProgressCallback) -> list[str]:
-    """Write the surface of every frame, the collection and the picture; arguments as for `one_folder_per_run`."""
+def _write_run(run: FinishedRun, folder: Path, progress: ProgressCallback) -> list[str]:
+    """Write the surface of every frame, the collection and the picture."""
     positions, picture = run.positions(), picture_png(run)
     run.require_same_pictures(drawn=False)
     plan, rest = make_plan(run.scene), rest_positions(run.scene.sheet)
@@ -63,6 +61,9 @@ def write(run: FinishedRun, folder: Path, progress: ProgressCallback) -> list[st
         write_new_file(folder / PICTURE_FILE, picture)
     write_new_file(folder / "surface.pvd", _document(collection))
     return []
+
+
+write = one_folder_per_run(_write_run)
 
 
 def speed(positions: Array, time: Array, frame: int) -> Array:
@@ -99,7 +100,7 @@ def _grid(position: Array, values: dict[str, Array]) -> Element:
     cells = SubElement(piece, "Cells")
     _add_array(cells, "connectivity", mesh.triangles.reshape(-1).astype(np.int64))
     _add_array(cells, "offsets", np.arange(3, mesh.triangles.size + 1, 3))
-    _add_array(cells, "types", np.full(len(mesh.triangles), TRIANGLE, np.uint8))
+    _add_array(cells, "types", np.full(len(mesh.triangles), 5, np.uint8))  # VTK_TRIANGLE
     return root
 
 

@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from taichi_msm.errors import ArgumentError, Key, Problem, SceneError, truncate
-from taichi_msm.images import PICTURE_SUFFIXES, file_sha256, irregular_kind
+from taichi_msm.images import PICTURE_SUFFIXES, actual_path, file_sha256, irregular_kind
 from taichi_msm.load.check import validate, value_at
 from taichi_msm.load.yaml_reader import MAX_DEPTH, Document, Mark, UnreadableError, mark_at, read_yaml
 from taichi_msm.model.plan import Plan
@@ -235,7 +235,7 @@ class Draft:
         elif key not in PICTURE_KEYS:
             # Validation stops at the first file of the cameras that is missing.
             try:
-                (folder / path).stat()
+                actual_path(str(folder / path)).stat()
             except OSError as error:
                 kind = "trajectory" if key[-1] == "poses" else "calibration"
                 message = f"{folder / path}: {(error.strerror or str(error)).lower()}; name a {kind} that can be read"

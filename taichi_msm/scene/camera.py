@@ -9,11 +9,10 @@ from typing import Annotated, Any, Literal
 from pydantic import Field, StrictBool, ValidationError, ValidationInfo, create_model, field_validator, model_validator
 from typing_extensions import Self
 
-from taichi_msm.camera_files.calibration import Calibration
-from taichi_msm.camera_files.calibrations import read_calibration
-from taichi_msm.camera_files.keys import ROUNDING_TOLERANCE
-from taichi_msm.camera_files.text import CameraFileError
-from taichi_msm.camera_files.trajectories import PoseKeys, read_poses
+from taichi_msm.camera_files.calibration import Calibration, focal_fault
+from taichi_msm.camera_files.camera_file import CameraFileError
+from taichi_msm.camera_files.key_lookup import ROUNDING_TOLERANCE
+from taichi_msm.camera_files.readers import PoseKeys, read_calibration, read_poses
 from taichi_msm.camera_files.trajectory import pose_fault
 from taichi_msm.lenses import MODELS
 from taichi_msm.lenses.model import MAX_COEFFICIENT
@@ -93,14 +92,14 @@ class Distortion(_Coefficients):  # type: ignore[misc]
 
     @model_validator(mode="after")
     def _check_coefficients_of_model(self) -> Self:
-        own = MODELS[self.model].coefficients
-        for name, row in own.items():
+        coefficients = MODELS[self.model].coefficients
+        for name, row in coefficients.items():
             if getattr(self, name) is None:
                 raise scene_fault(f"missing; expected {_COEFFICIENT.format(row.least, row.most)}", name)
-        for name in sorted(self.model_fields_set - {"model", *own}):
+        for name in sorted(self.model_fields_set - {"model", *coefficients}):
             if getattr(self, name):
                 models = _alternatives(model for model, row in MODELS.items() if name in row.coefficients)
-                *names, last = own
+                *names, last = coefficients
                 raise scene_fault(f"goes with model: {models}; a {self.model} has {', '.join(names)} and {last}", name)
         return self
 
@@ -231,7 +230,7 @@ class Camera(Section):
 
     @property
     def has_own_lens(self) -> bool:
-        """Whether a camera with a reference camera has intrinsics of its own."""
+        """Whether a camera with a reference camera has intrinsics, rather than those of the reference camera."""
         return self.intrinsics is not None or "fov" in self.model_fields_set
 
     @property
@@ -288,7 +287,7 @@ class Camera(Section):
             if len(both := [name for name in names if name in given]) > 1:
                 raise scene_fault(f"is given together with {both[0]}; remove one of them", both[1])
         for name in {"target", "up"} & given if {"pose", "poses"} & given else ():
-            raise scene_fault("goes with eye; a pose has a direction of its own", name)
+            raise scene_fault("goes with eye; a pose has its direction", name)
         return self
 
     def _check_pair(self, given: set[str]) -> None:
@@ -351,6 +350,9 @@ class Camera(Section):
     def calibrated(self, size: tuple[int, int]) -> Self:
         """Return a copy with the intrinsics and distortion of the calibration file for pictures of a size [px]."""
         if self.calibration is None:
+            given = self.intrinsics
+            if given and given.fx and given.fy and (fault := focal_fault((given.fx, given.fy), size)):
+                raise scene_fault(fault, "intrinsics")
             return self
         # Only a stereo pair uses the distance of the cameras.
         unit = self.calibration_unit if self.beside else "m"
@@ -358,6 +360,8 @@ class Camera(Section):
             calibration = read_calibration(self.calibration, self.calibration_eye, unit)
         except CameraFileError as error:
             raise scene_fault(str(error), "calibration") from None
+        if calibration.focal and (fault := focal_fault(calibration.focal, calibration.size or size)):
+            raise scene_fault(f"{self.calibration}: {fault}", "calibration")
         if self.scale and calibration.size is None:
             fault = "has no size of its pictures, so it cannot be scaled; add image_width and image_height"
             raise scene_fault(f"{self.calibration}: {fault}, or remove scale", "calibration")

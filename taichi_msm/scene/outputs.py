@@ -32,8 +32,8 @@ EXPORT_PREFIX = "export-"
 MAX_CAMERA_NAME = 64
 CAMERA_NAME = rf"[a-z0-9_-]{{1,{MAX_CAMERA_NAME}}}"
 
-# Number of the first frame in the name of its file, and the pattern of the numbers of all frames.
-FIRST_FRAME, FRAME_PATTERN = "0000", r"(?:[0-9]{4}|[1-9][0-9]{4,14})"
+# Number of the first frame in the name of its file.
+FIRST_FRAME = "0000"
 
 # Columns of the table of forces.
 FORCES_HEADER = ("time", "probe", "tip_x", "tip_y", "tip_z", "force_x", "force_y", "force_z")
@@ -75,7 +75,8 @@ class Output(NamedTuple):
     @property
     def pattern(self) -> str:
         """Regular expression for the paths of the files."""
-        return re.escape(self.file).replace(FIRST_FRAME, FRAME_PATTERN) if self.is_series else re.escape(self.file)
+        path = re.escape(self.file)
+        return path.replace(FIRST_FRAME, r"(?:[0-9]{4}|[1-9][0-9]{4,14})") if self.is_series else path
 
     def path(self, frame: int = 0) -> str:
         """Return the path of the file, or that of a frame of a series."""
@@ -142,7 +143,7 @@ RESULT_PATTERNS = (
 
 
 def result_names(folders: Mapping[str, Collection[str]]) -> list[str]:
-    """List the results of a run, as in `outputs` of run.json: folders of series, files, matrices of cameras, record.
+    """Return the results of a run, as in `outputs` of run.json: folders of series, files, matrices of cameras, record.
 
     Args:
         folders: names of the outputs, by the folders of the cameras; "" is the folder of the run.
@@ -158,7 +159,12 @@ def result_names(folders: Mapping[str, Collection[str]]) -> list[str]:
 
 
 def file_names(results: Iterable[str], frames: int) -> list[str]:
-    """List the files of a run with a number of frames, for results from `result_names`."""
+    """Return the paths of the files of a run.
+
+    Args:
+        results: results, from `result_names`.
+        frames: number of frames of the run.
+    """
     names: list[str] = []
     for result in results:
         folder, slash, name = result.rpartition("/")
@@ -168,7 +174,13 @@ def file_names(results: Iterable[str], frames: int) -> list[str]:
 
 
 def is_result(results: Collection[str], frames: int, name: str) -> bool:
-    """Return whether a path is in `file_names`, without listing them."""
+    """Return whether a path is one of `file_names`, without listing them.
+
+    Args:
+        results: results, from `result_names`.
+        frames: number of frames of the run.
+        name: path within the folder of the run.
+    """
     folder, _, file = name.rpartition("/")
     output, number = SERIES_FOLDERS.get(folder.rpartition("/")[2]), file.partition(".")[0]
     if output is None or not number.isdecimal():

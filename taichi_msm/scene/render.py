@@ -103,7 +103,7 @@ class Render(Section):
             raise scene_fault("has no camera; add one by its name")
         for name, camera in cameras.items():
             if not re.fullmatch(CAMERA_NAME, name):
-                raise scene_fault(f"is no name of a camera; take up to {MAX_CAMERA_NAME} of a-z, 0-9, _ and -", name)
+                raise scene_fault(f"is not a name of a camera; take up to {MAX_CAMERA_NAME} of a-z, 0-9, _ and -", name)
             if name in SERIES_FOLDERS or name.startswith(EXPORT_PREFIX):
                 raise scene_fault("is the name of a folder that is not a camera's; take another name", name)
             if name in PRESETS and camera != name:
@@ -171,7 +171,7 @@ class Render(Section):
     def companion(self, name: str) -> str:
         """Return the name of the first camera that is `beside` a camera, or "" if there is none."""
         cameras = self.all_cameras.items()
-        return next((other for other, camera in cameras if isinstance(camera, Camera) and camera.beside == name), "")
+        return next((key for key, camera in cameras if isinstance(camera, Camera) and camera.beside == name), "")
 
 
 def _read_files(camera: AnyCamera, info: ValidationInfo) -> AnyCamera:
@@ -186,18 +186,24 @@ def _read_files(camera: AnyCamera, info: ValidationInfo) -> AnyCamera:
 def _check_beside(name: str, cameras: Mapping[str, AnyCamera]) -> None:
     """Check that the chain of reference cameras of a camera ends at a camera with a pose."""
     if name == next(iter(cameras)):
-        raise scene_fault("the first camera is the main one, beside no other; put another one first", name, "beside")
+        raise scene_fault(
+            "the first camera is the main one, which has no reference camera; put another camera first", name, "beside"
+        )
     chain, camera = [name], cameras[name]
     while isinstance(camera, Camera) and camera.beside is not None:
         reference = camera.beside
         if reference in chain:
             if len(chain) == 1:
                 raise scene_fault(f"{reference} is this camera itself; name another one", name, "beside")
-            raise scene_fault(f"goes round, {', '.join([*chain, reference])}; give one of them an eye", name, "beside")
+            raise scene_fault(
+                f"the reference cameras form a circle, {', '.join([*chain, reference])}; give one of them an eye",
+                name,
+                "beside",
+            )
         if reference not in cameras:
             if len(chain) > 1:
                 return  # The fault is reported at the camera that has this key.
-            names = [other for other in cameras if other != name]
+            names = [candidate for candidate in cameras if candidate != name]
             hint = did_you_mean(reference, names) or f"; the others are {', '.join(names)}"
             raise scene_fault(f"{reference}: no camera has this name{hint}", name, "beside")
         chain.append(reference)

@@ -29,7 +29,12 @@ SCENE_FAULT = "refused"
 
 
 def scene_fault(message: str, *below: str | int) -> PydanticCustomError:
-    """Return the error that a validator raises for a fault of its value, or of the value at the keys `below` it."""
+    """Return the error that a validator raises for its value.
+
+    Args:
+        message: fault and remedy.
+        below: keys to the value at fault within the validated one; none for that value itself.
+    """
     return PydanticCustomError(SCENE_FAULT, message, {"below": below})
 
 
@@ -47,7 +52,13 @@ def format_value(value: Any) -> str:
 
 
 def key_problems(error: ValidationError, section: type[BaseModel], data: Any) -> list[Problem]:
-    """Translate errors of the validation of plain data against a section to problems at its keys."""
+    """Return pydantic's errors as problems at the keys of the scene.
+
+    Args:
+        error: errors of the validation.
+        section: section that the data was validated against.
+        data: validated data, of plain Python types.
+    """
     # A broken file of the largest size could have tens of thousands of faults.
     errors = error.errors(include_url=False, include_input=False)[:1000]
     faults = [_fault(details, section) for details in errors]
@@ -206,7 +217,7 @@ SheetFraction = Annotated[Number, Field(ge=MIN_FRACTION, le=MAX_FRACTION)]
 
 
 def key(default: Any, description: str, expects: str) -> Any:
-    """Declare a key of a section.
+    """Return the declaration of a key of a section.
 
     Args:
         default: default value; ... for a required key.
@@ -251,7 +262,16 @@ class Section(BaseModel, metaclass=_SectionMeta):
     model_config = ConfigDict(frozen=True, extra="forbid", validate_default=True)
 
     def model_copy(self, *, update: Mapping[str, Any] | None = None, deep: bool = False) -> Self:
-        """Return a copy of the section with some keys replaced; `deep` is ignored, as the values are immutable."""
+        """Return a copy of the section.
+
+        Args:
+            update: new values by keys; None for an equal copy.
+            deep: ignored, as the values are immutable.
+
+        Raises:
+            ArgumentError: when `update` is not a mapping from names of keys.
+            SceneError: when a key is unknown or a value invalid.
+        """
         del deep
         if not (update is None or (isinstance(update, Mapping) and all(isinstance(name, str) for name in update))):
             raise ArgumentError(f"update: {update!r}; take a mapping from keys to values")

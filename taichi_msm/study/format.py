@@ -23,7 +23,11 @@ def format_number(value: float) -> str:
 
 
 def time_unit(seconds: float) -> tuple[float, str]:
-    """Choose a readable unit of time; return its number in a second, and its name."""
+    """Choose a readable unit of time for a duration [s].
+
+    Returns:
+        Its number in a second, and its name.
+    """
     return next(((scale, name) for scale, name in TIME_UNITS if seconds * scale >= 0.9995), TIME_UNITS[-1])
 
 
@@ -93,6 +97,9 @@ def format_table(measurements: Sequence[Any], columns: Columns, remark: Callable
         measurements: measurements of one kind.
         columns: format functions of the cells, by the name of the column.
         remark: format function of a last column without a name, which is omitted if all its cells are empty.
+
+    Returns:
+        The table, without a final line break.
     """
     if remark and any(map(remark, measurements)):
         columns = {**columns, "": remark}

@@ -221,7 +221,7 @@ class MeshStudy:
             for plan in mesh_plans(self._plan):
                 seconds = self._measure_mesh(plan, opened)
             if not self._sheets:
-                note = f"points were not measured: with fewer than {MIN_POINTS_PER_SIDE} a side they cannot be compared"
+                note = f"points were not measured: a comparison needs at least {MIN_POINTS_PER_SIDE} a side"
                 self._study.notes.append(note)
                 return
             finer = self._finer_plan(self._plan, seconds, self._longest_run)
@@ -383,7 +383,7 @@ def measure_pictures(
     memory = process.available_memory() // 2
     finest = _with_render(scene, **REFERENCE_RENDER)
     if cost.drawing_bytes(finest) > memory:
-        study.notes.append("drawing was not measured: there is no memory for a picture fine enough to compare with")
+        study.notes.append("drawing was not measured: there is no memory for the reference picture")
         return
     reference = Rasterizer(finest, texture).draw(position)
     drawings, candidates = [], list(render_settings(scene, quick))

@@ -38,7 +38,11 @@ WITHOUT_MATPLOTLIB = "study.png needs matplotlib: pip install matplotlib"
 
 
 def require_writable(directory: Path) -> None:
-    """Check that a directory can be written; FilesError otherwise."""
+    """Check that a directory can be written.
+
+    Raises:
+        FilesError: when it cannot be written.
+    """
     with writing(directory), hidden_folder(directory):
         pass
 
@@ -185,7 +189,7 @@ def format_summary(study: Study) -> str:
     if remark_lines := [*notes, *_bounds([*fastest, *study.points]), *remarks(study)]:
         blocks.append("\n".join(remark_lines))
     if recommended := study.recommendation():
-        blocks += ["To put in the scene:", "\n".join(recommended)]
+        blocks += ["Recommended settings of the scene:", "\n".join(recommended)]
     return "\n\n".join(blocks)
 
 
@@ -199,8 +203,8 @@ def remarks(study: Study) -> Iterator[str]:
     bound = f"{'' if mesh.known else 'at most about '}{format_number(mesh.error or 0.0)}"
     if recommended is None:
         step = study.best_stepping
-        step_error = "" if step is None else f", the recommended step one of {format_number(step.error or 0.0)}"
-        yield f"{mesh.name} points make an error of {bound}{step_error}; the tolerance is {study.mesh_tolerance:g}."
+        step_error = "" if step is None else f", and the recommended step of {format_number(step.error or 0.0)}"
+        yield f"{mesh.name} points have an error of {bound}{step_error}; the tolerance is {study.mesh_tolerance:g}."
         return
     rows, cols = recommended
     points = f"{rows} x {cols}"
@@ -214,7 +218,7 @@ def remarks(study: Study) -> Iterator[str]:
         sufficient = f"{points} are within it" if measured else f"Take about {points} (extrapolated, not measured)"
         advice = f"{sufficient}; with time.tolerance a run finds the step for them."
     yield (
-        f"{mesh.name} points make an error of {bound}, which no step can mend; the tolerance is "
+        f"{mesh.name} points have an error of {bound}, which no step reduces; the tolerance is "
         f"{study.mesh_tolerance:g}. {advice}"
     )
 
@@ -255,11 +259,11 @@ def _stepping(study: Study) -> Iterator[str]:
 
 def _meshes(study: Study) -> Iterator[str]:
     yield "## Points"
-    reference = "the finest sheet" if study.has_contact else "the extrapolation, of order 2, of the two finest sheets"
+    reference = "the finest mesh" if study.has_contact else "the extrapolation, of order 2, of the two finest meshes"
     yield (
-        "The error is that made by the number of points, at the points and between them, where the displacement is "
+        "The error is the discretisation error of the mesh, at the points and between them, where the displacement is "
         "interpolated by cubics: the largest anywhere at any frame, as a fraction of the largest displacement. The "
-        f"reference is {reference}. All are stepped in f64 with the same step. Times are those of each sheet's "
+        f"reference is {reference}. All are stepped in f64 with the same step. Times are those of each mesh's "
         "automatic step."
     )
     yield _meshes_table(study)
@@ -269,7 +273,7 @@ def _meshes(study: Study) -> Iterator[str]:
 def _bounds(points: Sequence[ErrorMeasurement]) -> Iterator[str]:
     """Yield an explanation of errors that are upper bounds, if there are any."""
     if any(format_error(point).startswith("<") for point in points):
-        yield "An error with < is an approximate upper bound; the reference is not exact enough to know the error."
+        yield "An error with < is an approximate upper bound, as the reference is not accurate enough."
 
 
 def _methods_table(study: Study, points: Sequence[SteppingMeasurement], columns: Columns) -> str:

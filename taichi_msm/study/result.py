@@ -12,9 +12,6 @@ import numpy as np
 
 from taichi_msm.scene.section import MAX_POINTS
 
-# A refinement suffices within this distance from the best PSNR with the same supersampling [dB].
-PSNR_TOLERANCE_DB = 0.1
-
 
 @dataclass(frozen=True)
 class Timing:
@@ -189,7 +186,8 @@ class Study:
             for drawing in self.drawing
             if drawing.supersample == supersample
         ]
-        min_psnr = max((psnr for psnr, _ in decibels), default=0.0) - PSNR_TOLERANCE_DB
+        # Sufficient is a distance of 0.1 dB from the best.
+        min_psnr = max((psnr for psnr, _ in decibels), default=0.0) - 0.1
         sufficient = [drawing for psnr, drawing in decibels if psnr >= min_psnr]
         return min(sufficient, key=lambda drawing: drawing.seconds.median, default=None)
 

@@ -19,9 +19,6 @@ from taichi_msm.system import process, runtime
 from taichi_msm.system.compiler import versions
 from taichi_msm.system.runtime import Device
 
-# Approximate time limit of a run of the whole scene [s].
-QUICK_RUN_S, FULL_RUN_S = 0.25, 2.0
-
 
 def run_study(
     scene: Plan | Scene,
@@ -38,12 +35,15 @@ def run_study(
     Args:
         scene: the scene or its plan.
         name: of the scene, in the report.
-        tolerance: largest allowed error, as a fraction of the largest displacement; None: the scene's, otherwise 1e-3.
+        tolerance: largest allowed error, as a fraction of the largest displacement; by default the scene's, or 1e-3.
         quick: whether to measure fewer settings, in about a minute for a small sheet.
         arch: cpu, cuda or vulkan.
-        threads: number of CPU threads; None: one per core.
+        threads: number of CPU threads, by default one per core.
         progress: called with the stage, the finished part and the total; after a KeyboardInterrupt from it the study
             returns the results so far.
+
+    Returns:
+        The measurements, without a report.
 
     Raises:
         SceneError: when the scene is quasi-static, the picture cannot be decoded, or the trajectories do not fit in
@@ -63,7 +63,8 @@ def run_study(
         tolerance=tolerance or scene.time.tolerance or 1e-3,
         machine=machine_record(device),
     )
-    longest_run = QUICK_RUN_S if quick else FULL_RUN_S
+    # Approximate time limit of a run of the whole scene [s].
+    longest_run = 0.25 if quick else 2.0
     # The study itself varies the step.
     plan = choose_precision(plan_variant(plan, with_time(scene, tolerance=None)), device.arch)
     scene = plan.scene

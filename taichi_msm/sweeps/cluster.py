@@ -38,7 +38,12 @@ MAX_WAIT_S = 10
 class Inputs(WorkerPlugin):  # type: ignore[misc]  # that package has no types
     """Worker plugin with the common inputs of all runs of a sweep.
 
+    Args:
+        sweep: its scene and the contents of its files are sent to every worker.
+        directory: of the sweep; workers must have access to it.
+
     Attributes:
+        versions: required versions of this package and its libraries, by name.
         error: reason why the worker cannot execute runs; empty if it can.
         copies: local copies of the files, by their paths on the machine where the sweep was started.
     """
@@ -100,14 +105,30 @@ class Inputs(WorkerPlugin):  # type: ignore[misc]  # that package has no types
 
 
 class Cluster(ClientExecutor):  # type: ignore[misc]
-    """Executor for the workers of a scheduler, which sends only the number, overrides and directory of each run."""
+    """Executor for the workers of a scheduler, which sends only the number, overrides and directory of each run.
+
+    Args:
+        client: connection to the scheduler.
+        name: name of the plugin `Inputs`.
+    """
 
     def __init__(self, client: Any, name: str) -> None:
         super().__init__(client, pure=False)
         self._name = name
 
     def submit(self, function: Callable[..., Any], /, *arguments: Any) -> Future[Any]:
-        """Schedule a call of an importable function in an idle worker."""
+        """Schedule a call in an idle worker.
+
+        Args:
+            function: an importable function; for `execute_run`, inputs that the worker has are not sent.
+            arguments: picklable arguments of the function.
+
+        Returns:
+            The future result.
+
+        Raises:
+            BrokenExecutor: when the connection to the scheduler is lost.
+        """
         call: tuple[Any, ...] = (_call, self._name, function, *arguments)
         if function is execute_run:
             (task,) = arguments
@@ -153,9 +174,12 @@ def cluster_connection(
 
     Args:
         address: of the scheduler, such as tcp://10.0.0.1:8786.
-        sweep: the sweep.
+        sweep: its scene and files are the inputs.
         directory: of the sweep.
         progress: called while waiting for the first worker.
+
+    Yields:
+        An executor for the workers.
 
     Raises:
         ExecutorError: when no scheduler answers, or a worker cannot execute runs.
@@ -215,7 +239,7 @@ def _register_inputs(inputs: Inputs, name: str, client: Any) -> None:
         raise
     except Exception as error:
         # Unpickling raises an arbitrary error if a worker lacks a package.
-        raise ExecutorError(f"a worker cannot take runs: {error}; install there what is here") from None
+        raise ExecutorError(f"a worker cannot take runs: {error}; install the same packages there") from None
 
 
 def _wait_for_worker(client: Any, progress: StageProgressCallback) -> None:

@@ -83,7 +83,7 @@ def _value(node: ast.expr, names: Mapping[str, float]) -> float:
         case ast.Name(id=name):
             if name not in names:
                 remedy = did_you_mean(name, names) or "; name it in variables"
-                raise ExpressionError(f"{name} is no variable{remedy}")
+                raise ExpressionError(f"{name} is not a variable{remedy}")
             return names[name]
         case ast.BinOp(left=left, op=op, right=right) if type(op) in _OPERATORS:
             values, function = [_value(left, names), _value(right, names)], _OPERATORS[type(op)]
@@ -105,7 +105,7 @@ def _value(node: ast.expr, names: Mapping[str, float]) -> float:
 
 
 def replace_expressions(value: Any, change: Callable[[Key, str], Any], path: Key = ()) -> Any:
-    """Replace the expressions in a value of `set`.
+    """Return a value of `set` with its expressions replaced.
 
     Args:
         value: plain data.

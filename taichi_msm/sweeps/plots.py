@@ -55,7 +55,12 @@ class PlotData(NamedTuple):
 
 
 def plot(data: PlotData, file: BinaryIO) -> None:
-    """Plot sweep.png, with a panel for each result and each of the most sensitive parameters, to a file."""
+    """Plot sweep.png, with a panel for each result and each of the most sensitive parameters.
+
+    Args:
+        data: parameters and results of the plotted runs.
+        file: receives the PNG.
+    """
     from matplotlib import style
 
     with style.context(STYLE, after_reset=True), warnings.catch_warnings():
@@ -185,7 +190,17 @@ class Tile(NamedTuple):
 def write_contact_sheet(
     state: SweepState, written: list[str], executor: Executor, progress: StageProgressCallback
 ) -> list[str]:
-    """Write contact.jpg, if any run has a frame; arguments as of `tables.write_reports`; return warnings."""
+    """Write contact.jpg, if any run has a frame.
+
+    Args:
+        state: the finished sweep.
+        written: names of the written reports; contact.jpg is appended.
+        executor: draws the frames of runs without pictures.
+        progress: called with the stage, the drawn and the total number of frames.
+
+    Returns:
+        Warnings.
+    """
     runs = spread(len(state.outcomes), 36)
     complete = [run for run in runs if state.outcomes[run].status == "complete"]
     frames, errors = _largest_frames({run: state.run_directory(run) for run in complete}, executor, progress)
@@ -253,7 +268,18 @@ def _largest_frames(
 
 
 def read_gif_frame(path: Path, time: float) -> Image.Image:
-    """Read the picture that an animated GIF shows at a time [s], or its last one."""
+    """Read a picture of an animated GIF.
+
+    Args:
+        path: the GIF.
+        time: time from its start [s].
+
+    Returns:
+        The RGB picture at that time; after the end the last one.
+
+    Raises:
+        FilesError: when the GIF cannot be read or decoded.
+    """
     with reading(path), Image.open(path, formats=["GIF"]) as film:
         for number in range(film.n_frames):
             film.seek(number)
@@ -355,7 +381,12 @@ class VariedParameter(NamedTuple):
 
 
 def varied_parameters(state: SweepState, runs: Sequence[int]) -> list[VariedParameter]:
-    """Return the parameters that differ between the numbered runs, in the order of the keys."""
+    """Return the parameters that differ between runs, in the order of the keys.
+
+    Args:
+        state: the finished sweep.
+        runs: numbers of the compared runs.
+    """
     names = abbreviate_keys(state.sweep.keys)
     columns = zip(*(state.values[run] for run in runs), strict=True)
     return [
@@ -367,9 +398,14 @@ def varied_parameters(state: SweepState, runs: Sequence[int]) -> list[VariedPara
 
 
 def varied_results(state: SweepState, runs: Sequence[int]) -> dict[str, NDArray[np.float64]]:
-    """Return the results that differ between the numbered runs: columns of the table, shape (runs,).
+    """Return the columns of the table that differ between runs, by name.
 
-    They have NaN where a run is incomplete or lacks the result.
+    Args:
+        state: the finished sweep.
+        runs: numbers of the compared runs.
+
+    Returns:
+        Columns, shape (runs,); NaN where a run is incomplete or lacks the result.
     """
     complete = [state.outcomes[run].status == "complete" for run in runs]
     columns = {}
@@ -421,11 +457,14 @@ class SensitivityIndex(NamedTuple):
 def estimate_sensitivity(
     parameters: Sequence[VariedParameter], results: Mapping[str, NDArray[np.float64]]
 ) -> list[SensitivityIndex]:
-    """Estimate the first-order sensitivities of results in at least 64 runs.
+    """Estimate the first-order sensitivities of results.
 
     Args:
-        parameters: the parameters.
+        parameters: parameters that vary, with values of shape (runs,).
         results: by name, shape (runs,); NaN where a run lacks the result.
+
+    Returns:
+        An index for every parameter of every result that at least 64 runs have.
 
     Raises:
         ImportError: when SALib is not installed.

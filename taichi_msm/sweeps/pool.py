@@ -30,7 +30,11 @@ class DiedError(MsmError):
 
 
 class Pool(Executor):
-    """Executor that starts processes on demand; functions, arguments and results must be picklable."""
+    """Executor that starts processes on demand.
+
+    Args:
+        workers: largest number of processes.
+    """
 
     def __init__(self, workers: int) -> None:
         self._threads = ThreadPoolExecutor(workers)
@@ -38,11 +42,25 @@ class Pool(Executor):
         self._lock, self._closed = Lock(), False
 
     def submit(self, function: Callable[..., Any], /, *arguments: Any, **named: Any) -> Future[Any]:
-        """Schedule a call of an importable function in an idle process."""
+        """Schedule a call in an idle process.
+
+        Args:
+            function: an importable function.
+            arguments: picklable arguments of the function.
+            named: picklable named arguments of the function.
+
+        Returns:
+            The future result, which must be picklable; a `DiedError` if the process ends early.
+        """
         return self._threads.submit(self._call, function, arguments, named)
 
     def shutdown(self, wait: bool = True, *, cancel_futures: bool = False) -> None:
-        """End the processes after their calls, or with `cancel_futures` at once."""
+        """End the processes after their calls.
+
+        Args:
+            wait: whether to wait for the end of the calls.
+            cancel_futures: whether to cancel pending calls, and to kill the processes at once.
+        """
         self._threads.shutdown(wait=False, cancel_futures=cancel_futures)
         if cancel_futures:
             with self._lock:

@@ -76,8 +76,8 @@ def _register(sweep: Sweep, directory: Path) -> list[list[Any]]:
     if changed := [name for name, value in json.loads(json.dumps(description)).items() if value != earlier[name]]:
         noun = {"digest": "the scene file", "files": "a file"}.get(changed[0], changed[0])
         if changed[0] == "files" and isinstance(earlier["files"], dict):
-            other = (path for path, digest in description["files"].items() if earlier["files"].get(path) != digest)
-            noun = next(other, noun)
+            files = (path for path, digest in description["files"].items() if earlier["files"].get(path) != digest)
+            noun = next(files, noun)
         message = f"holds the runs of another sweep: {noun} differs"
         raise SceneError([f"{directory}: {message}; choose another --out"])
     current = result_versions(versions(), "cpu")
@@ -124,6 +124,9 @@ def begin_sweep(sweep: Sweep, directory: Path, shard: tuple[int, int] = (1, 1)) 
         directory: of the sweep; created if it does not exist.
         shard: part I of N as (I, N), 1 <= I <= N.
 
+    Returns:
+        The finished and the missing runs of the shard.
+
     Raises:
         SceneError: when the directory contains another sweep, or versions with other results.
         FilesError: when the directory cannot be read or written, contains foreign files, or is damaged.
@@ -142,7 +145,15 @@ def begin_sweep(sweep: Sweep, directory: Path, shard: tuple[int, int] = (1, 1)) 
 
 
 def read_outcome(task: RunTask, sweep: Sweep) -> Outcome | None:
-    """Read the outcome of a finished run; None if it is missing, was interrupted, or belongs to another task."""
+    """Read the outcome of a finished run.
+
+    Args:
+        task: the run; its overrides must be those of the record.
+        sweep: its files must contain those of the record.
+
+    Returns:
+        The outcome; None if the record is missing or damaged, of an interrupted run, or of another task.
+    """
     # A run with a damaged record is repeated.
     with suppress(OSError, ValueError, KeyError, TypeError, AttributeError, RecursionError):
         if entry_kind(task.directory / RUN_RECORD) == FILE:
@@ -155,7 +166,15 @@ def read_outcome(task: RunTask, sweep: Sweep) -> Outcome | None:
 
 
 def lock_reports(directory: Path, pause: errors.Pause) -> BinaryIO:
-    """Lock a sweep's reports until the file is closed; `pause` is called while another command holds the lock."""
+    """Lock the reports of a sweep.
+
+    Args:
+        directory: of the sweep.
+        pause: called repeatedly while another command holds the lock; an exception from it ends the wait.
+
+    Returns:
+        The locked file; closing it releases the lock.
+    """
     while True:
         try:
             return lock_file(directory / SWEEP_RECORD)
@@ -177,6 +196,9 @@ def run_missing(state: SweepState, executor: Executor, progress: StageProgressCa
         state: the sweep; outcomes are appended.
         executor: executes the runs.
         progress: called several times a second; an exception from it ends the sweep.
+
+    Yields:
+        The outcome of each run.
 
     Raises:
         LostExecutorError: when the executor accepts no more runs.
@@ -249,22 +271,12 @@ def execute_run(task: RunTask, progress: StageProgressCallback = lambda stage, d
         progress: called several times a second; may raise KeyboardInterrupt, as in `runs.run.run`.
 
     Returns:
-        The outcome, also of a run that fails.
+        The outcome, also of a run that fails: the function raises nothing but an exception from `progress`.
     """
     os.chdir(task.home)
     status: Status
     try:
-        plan = plan_file(task.scene, task.overrides)
-        try:
-            cost.require_disk(plan, task.directory)
-        except SceneError as error:
-            raise FilesError(str(error)) from None
-        from taichi_msm.runs import run as run_module
-
-        record = run_module.run(
-            plan, task.directory, threads=1, overrides=task.overrides, started=time.perf_counter(), progress=progress
-        )
-        return _outcome_from_record(task.run, record)
+        return _outcome_from_record(task.run, _run_scene(task, progress))
     except SceneError as error:  # also for a picture that cannot be decoded
         status, reason = "refused", "; ".join(error.lines)
     except errors.MsmError as error:
@@ -274,6 +286,20 @@ def execute_run(task: RunTask, progress: StageProgressCallback = lambda stage, d
     # The reason is independent of absolute paths. The path of a picture follows a space.
     reason = " ".join(reason.split()).replace(str(task.directory), task.directory.name)
     return Outcome(task.run, status, reason.replace(f" {task.scene.folder / '_'}"[:-1], " "))
+
+
+def _run_scene(task: RunTask, progress: StageProgressCallback) -> Mapping[str, Any]:
+    """Run the scene of a task; return the record."""
+    plan = plan_file(task.scene, task.overrides)
+    try:
+        cost.require_disk(plan, task.directory)
+    except SceneError as error:  # A full disk is a failure, not a refusal.
+        raise FilesError(str(error)) from None
+    from taichi_msm.runs.run import run
+
+    return run(
+        plan, task.directory, threads=1, overrides=task.overrides, started=time.perf_counter(), progress=progress
+    )
 
 
 # "refused": invalid values; "failed": an error; "died": the process ended early twice.

@@ -69,9 +69,8 @@ class Distribution(Section):
     @classmethod
     def _is_flat(cls, data: Any) -> Any:
         if not isinstance(data, dict):
-            raise scene_fault(
-                f"{format_value(data)} is no way to vary; take one, such as {{uniform: [1, 2]}} or {{choice: [1, 2]}}"
-            )
+            remedy = "take one such as {uniform: [1, 2]} or {choice: [1, 2]}"
+            raise scene_fault(f"{format_value(data)} is not a distribution; {remedy}")
         if data.keys().isdisjoint(cls.model_fields) and any(isinstance(value, dict) for value in data.values()):
             raise scene_fault("give each key by its dotted path, such as tissue.young: {uniform: [1e4, 3e4]}")
         return data
@@ -233,11 +232,11 @@ class SweepSettings(Section):
                 or keyword.iskeyword(name)
                 or not re.fullmatch(r"[A-Za-z_]\w*", name, re.A)
             ):
-                raise scene_fault("is no name of a variable; take letters, digits and _, such as x1", name)
+                raise scene_fault("is not a name of a variable; take letters, digits and _, such as x1", name)
             for value in distribution.values:
                 if isinstance(value, list) or not _numbers(value):
                     raise scene_fault(
-                        f"{format_value(value)} is no number; variables are numbers", name, distribution.kind
+                        f"{format_value(value)} is not a number; variables are numbers", name, distribution.kind
                     )
         return variables
 
@@ -274,7 +273,12 @@ class SweepSettings(Section):
 
 
 def spread(total: int, limit: int) -> list[int]:
-    """Return the numbers of all runs, or of `limit` evenly spaced ones."""
+    """Return numbers of evenly spaced runs.
+
+    Args:
+        total: number of runs.
+        limit: largest number of returned ones.
+    """
     count = min(total, limit)
     return [(2 * n + 1) * total // (2 * count) for n in range(count)]
 
@@ -414,6 +418,9 @@ def make_sweep(scene: str | Path, settings: Mapping[str, Any]) -> Sweep:
     Args:
         scene: path of the scene file, the base of relative paths in `settings`.
         settings: content of a sweep file, without `scene`.
+
+    Returns:
+        The sweep; its fixed and varied paths are relative to the scene file.
 
     Raises:
         ArgumentError: when a value cannot be represented in JSON.

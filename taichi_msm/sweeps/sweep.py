@@ -54,12 +54,12 @@ def sweep(
             its folder.
         directory: receives runs/, table.csv and the other reports.
         variables: distributions of the numbers in expressions of `overrides`, by name, as in a sweep file.
-        samples: number of runs; None: every combination of the keys' grids.
+        samples: number of runs; None for every combination of the keys' grids.
         seed: seed of the samples.
         overrides: values of keys in all runs, by dotted key; texts that begin with = are expressions of the variables.
-        executor: executes the runs; None: processes on this machine. Its workers must be processes with one thread,
-            with scene and directory at the same paths. A string is the address of a dask.distributed scheduler.
-        workers: number of processes on this machine; None: one per core, limited by the free memory.
+        executor: executes the runs, by default in processes on this machine. Its workers must be processes with one
+            thread, with scene and directory at the same paths. A string is the address of a dask.distributed scheduler.
+        workers: number of processes on this machine, by default one per core, limited by the free memory.
         progress: called often with the stage, the number of finished runs and the number of runs; an exception from it
             stops the sweep.
 
@@ -113,6 +113,9 @@ def open_executor(
         state: the sweep.
         progress: called while waiting for the first worker of a cluster.
 
+    Yields:
+        The opened executor.
+
     Raises:
         NotInstalledError: when dask.distributed is needed and not installed.
         ExecutorError, LostExecutorError: as `cluster.cluster_connection`.
@@ -138,7 +141,16 @@ def open_executor(
 
 
 def finish_sweep(state: SweepState, executor: Executor, progress: StageProgressCallback) -> tuple[list[str], list[str]]:
-    """Write the table and the other reports of a sweep whose runs have ended, as `tables.write_reports`."""
+    """Write the table and the other reports of a sweep whose runs have ended.
+
+    Args:
+        state: the sweep; outcomes of runs that another command has finished are replaced.
+        executor: draws the last frames of runs without pictures.
+        progress: called while another command writes the reports, and while frames are drawn.
+
+    Returns:
+        Names of the written files, and warnings, as `tables.write_reports`.
+    """
     directory, total = state.directory, len(state.values)
     with writing(directory), lock_reports(directory, lambda: progress("runs", total, total)):
         # A run that was locked by another command may be finished now.

@@ -116,7 +116,15 @@ def write_table(state: SweepState) -> None:
 
 
 def write_parquet(state: SweepState, written: list[str]) -> list[str]:
-    """Write table.parquet if pyarrow is installed; return no warnings."""
+    """Write table.parquet if pyarrow is installed.
+
+    Args:
+        state: the finished sweep.
+        written: names of the written reports; table.parquet is appended.
+
+    Returns:
+        No warnings.
+    """
     try:
         import pyarrow
         from pyarrow import parquet
@@ -159,7 +167,15 @@ def csv_line(row: Iterable[Any]) -> str:
 
 
 def write_dataset(state: SweepState, written: list[str]) -> list[str]:
-    """Write dataset.json, with a line for every complete run; return no warnings."""
+    """Write dataset.json, with a line for every complete run.
+
+    Args:
+        state: the finished sweep.
+        written: names of the written reports; dataset.json is appended.
+
+    Returns:
+        No warnings.
+    """
     sweep, complete = state.sweep, [outcome.run for outcome in state.outcomes if outcome.status == "complete"]
     common = _output_format(state.run_directory(complete[0])) if complete else {}
     # The sections of a scene that determine the output format.
@@ -186,7 +202,12 @@ def write_dataset(state: SweepState, written: list[str]) -> list[str]:
 
 
 def assign_splits(runs: int, seed: int) -> list[str]:
-    """Return the split of the data set for each of a number of runs: "train", "val" or "test"."""
+    """Return the split of every run, "train", "val" or "test", as described above.
+
+    Args:
+        runs: number of runs.
+        seed: seed of the sweep.
+    """
     order = sorted(range(runs), key=lambda run: hashlib.sha256(f"{seed} {run}".encode()).digest())
     tenth = (runs + 5) // 10
     splits = ["train"] * runs
@@ -212,7 +233,13 @@ def _json(value: Any) -> bytes:
 
 
 def cost_line(runs: int, expected: SweepCost, workers: WorkerCount | None) -> str:
-    """Format the cost of a number of runs, in processes of this machine or (None) elsewhere, as a line."""
+    """Return the expected cost of runs as a line.
+
+    Args:
+        runs: number of runs.
+        expected: their cost.
+        workers: processes of this machine; None for a cluster.
+    """
     location = "if they were run here"
     if workers is not None:
         processes = f"{workers.number} {'process' if workers.number == 1 else 'processes'}"
@@ -233,9 +260,12 @@ def summary_lines(
     Args:
         directory: of the sweep.
         outcomes: of the sweep or shard.
-        shard: part I of N as (I, N); None: the whole sweep.
+        shard: part I of N as (I, N); None for the whole sweep.
         files: names of the reports.
         notes: warnings about the reports.
+
+    Returns:
+        Lines for the terminal.
     """
     part = f" of part {shard[0]} of {shard[1]}" if shard else ""
     counts = ", ".join(f"{number} {status}" for status, number in count_statuses(outcomes).items() if number)
@@ -244,7 +274,7 @@ def summary_lines(
         example = next((outcome for outcome in outcomes if outcome.status == status), None)
         if example and example.error:
             lines.append(f"{status}, for example run {example.run:06}: {example.error}")
-    for name, cause in (("error_estimate", "the time step"), ("mesh_error", "the number of points")):
+    for name, cause in (("error_estimate", "the time step"), ("mesh_error", "the mesh")):
         errors = [(getattr(outcome, name), outcome.run) for outcome in outcomes if getattr(outcome, name) is not None]
         if errors:
             largest, run = max(errors)
@@ -327,7 +357,13 @@ def estimate_cost(sweep: Sweep) -> SweepCost:
 def choose_worker_count(expected: SweepCost, runs: int, requested: int | None = None) -> WorkerCount:
     """Choose the number of processes: one per core, limited by the free memory and the number of runs.
 
-    A number that the user has requested is not limited.
+    Args:
+        expected: cost of the sweep, with the memory of a process.
+        runs: number of runs.
+        requested: number of processes that the user has requested, which is not limited; None to choose.
+
+    Returns:
+        The number and its limits.
     """
     cores, memory_limit = available_threads(), available_memory() // expected.memory_bytes
     return WorkerCount(requested or max(1, min(cores, memory_limit, runs)), cores, memory_limit)

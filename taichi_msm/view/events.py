@@ -118,17 +118,23 @@ KEYS = {
     "q": "quit",
 }
 
-_CONFIG = ConfigDict(strict=True, allow_inf_nan=False)
 _EVENTS: dict[str, TypeAdapter[Event]] = {
-    kind.__name__.lower(): TypeAdapter(kind, config=_CONFIG) for kind in get_args(Event)
+    kind.__name__.lower(): TypeAdapter(kind, config=ConfigDict(strict=True, allow_inf_nan=False))
+    for kind in get_args(Event)
 }
 
 
 def parse_message(message: str | bytes) -> Event | None:
-    """Parse a message; return its event, or None for `SHOWN`.
+    """Parse a message of a page.
+
+    Args:
+        message: JSON list of the name of an event and its values.
+
+    Returns:
+        The event; None for `SHOWN`.
 
     Raises:
-        ValueError: when it is neither.
+        ValueError: when the message is invalid; names the event and the reason.
     """
     values: Any = json.loads(message)
     if values == SHOWN:

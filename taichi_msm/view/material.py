@@ -38,7 +38,13 @@ def material_values(scene: Scene) -> dict[str, float]:
 
 
 def with_value(section: Any, key: str, value: float) -> Any:
-    """Return a copy of a scene or a section with a new value of a key, given by its dotted path."""
+    """Return a copy of a scene or a section with another value.
+
+    Args:
+        section: the scene, or a section of it; not validated again.
+        key: dotted path of a number below it.
+        value: the number, in the unit of its key.
+    """
     name, _, rest = key.partition(".")
     below: Section | float = with_value(getattr(section, name), rest, value) if rest else value
     return section.model_copy(update={name: below})

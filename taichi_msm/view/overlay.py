@@ -23,7 +23,7 @@ OUTLINE_GREY = 140
 class ValueBar(NamedTuple):
     """A value as a bar, scaled to the largest value so far, rounded up."""
 
-    value: float
+    value: float  # in `unit`, as the others
     largest: float  # positive
     unit: str
 
@@ -47,8 +47,8 @@ def write_text(
         picture: shape (height, width, 3).
         above: lines in the upper left corner, above the bar and the two columns of the table.
         below: text at the bottom, which is wrapped.
-        table: names and their meanings.
-        bar: a value.
+        table: names and their meanings, such as keys and their effects.
+        bar: value that is shown as a bar.
     """
     height, width = picture.shape[:2]
     # Height of letters [px].
@@ -67,7 +67,13 @@ def write_text(
 
 
 def mark_tool(picture: Picture, pixel: tuple[float, float], *, pulls: bool) -> None:
-    """Draw a ring around the pixel (x, y) of a tool into a picture, shape (height, width, 3)."""
+    """Draw a ring around a tool into a picture, in place.
+
+    Args:
+        picture: shape (height, width, 3).
+        pixel: centre (x, y) of the ring [px]; may be outside of the picture.
+        pulls: whether the ring has the colour of pulling.
+    """
     radius = picture.shape[0] * (1 / 50)
     reach = int(radius) + 4
     left, top = max(0, int(pixel[0]) - reach), max(0, int(pixel[1]) - reach)

@@ -22,9 +22,6 @@ from taichi_msm.scene.outputs import OUTPUTS
 from taichi_msm.scene.render import Render
 from taichi_msm.scene.scene import Scene
 
-# The C emitter is ten times faster, with the same output.
-_DUMPER: Any = getattr(yaml, "CSafeDumper", yaml.SafeDumper)
-
 
 class Film:
     """A film of a session, encoded in a hidden folder while the session runs; `close` removes it unless it was moved.
@@ -55,7 +52,12 @@ class Film:
             self._opened = opened.pop_all()
 
     def add_frame(self, picture: Picture, frame: int) -> None:
-        """Append the picture of a frame, shape (height, width, 3), repeated in place of missing earlier ones."""
+        """Append a picture, repeated in place of missing earlier ones.
+
+        Args:
+            picture: shape (height, width, 3).
+            frame: its frame of the session.
+        """
         with writing(*self._location):
             while self.pictures * self._subframes <= frame - self._begin:
                 self._encoder.add(picture[None])
@@ -99,8 +101,10 @@ class Captures:
             scene = scene.with_pictures(lambda path: self._copy_picture(Path(path)).name)
             data = scene.model_dump(mode="json", exclude_none=True)
             style: dict[str, Any] = {"sort_keys": False, "default_flow_style": None, "width": 120}
-            text = yaml.dump(data, Dumper=_DUMPER, allow_unicode=True, **style)
-            text = f"# What was done in a live session of {printable(self._name)}; `run` repeats it.\n{text}"
+            # The C emitter is ten times faster, with the same output.
+            dumper: Any = getattr(yaml, "CSafeDumper", yaml.SafeDumper)
+            text = yaml.dump(data, Dumper=dumper, allow_unicode=True, **style)
+            text = f"# Recorded in a live session of {printable(self._name)}; `run` repeats it.\n{text}"
             # Without the keyframes of its probes, a scene has at most 1000 values.
             if len(text.encode()) > MAX_BYTES or count_probe_values(scene) + 1000 > MAX_NODES:
                 raise FilesError("this session is too long for a scene file; reset it, and do less")
@@ -108,7 +112,15 @@ class Captures:
             return self._move_to_free_name(hidden / "session", "session", ".yaml")
 
     def save_film(self, film: Film, path: Path | None = None) -> Path:
-        """Finish and save a film with at least one picture under a path, or a free name in the folder; return it."""
+        """Finish and save a film.
+
+        Args:
+            film: a film with at least one picture.
+            path: its file, which is replaced; None for a free name in the folder.
+
+        Returns:
+            The path of the saved file.
+        """
         with closing(film), writing(path or self.folder):
             if path is None:
                 return self._move_to_free_name(film.finish(), "film", ".gif")

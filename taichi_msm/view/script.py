@@ -108,6 +108,9 @@ def load_script(path: str | Path, size: tuple[int, int]) -> Script:
         path: the script file.
         size: width and height of the session's picture [px].
 
+    Returns:
+        The script; all its pixels are in the picture.
+
     Raises:
         SceneError: with a line for each error of the file, in the order of the file.
     """

@@ -71,7 +71,13 @@ MAX_STEPPING_S = 0.03
 
 
 def listen(port: int) -> socket.socket:
-    """Listen on a port of the loopback interface; 0: a free one.
+    """Listen on a port of the loopback interface.
+
+    Args:
+        port: number of the port, or 0 for a free one.
+
+    Returns:
+        The listening socket, which does not block.
 
     Raises:
         DeviceError: when the port cannot be used.
@@ -92,7 +98,11 @@ class Server:
         session: a new session.
         listener: see `listen`.
         title: of the page.
-        origins: of pages behind a proxy, in addition to the loopback interface's own.
+        origins: of pages behind a proxy, in addition to those of the loopback interface.
+
+    Attributes:
+        url: address of the page, with the token.
+        pages: connected pages; the first one steers.
     """
 
     def __init__(self, session: Session, listener: socket.socket, title: str, origins: Collection[str] = ()) -> None:
@@ -142,8 +152,10 @@ class Server:
         """Return whether an origin is this server's, or that of a port that `ssh -L` forwards to it."""
         try:
             parts, forwarded = urlsplit(origin), urlsplit(f"//{host}").port
-            own = f"{parts.scheme}://{parts.netloc}" == origin and parts.scheme == "http"
-            return own and parts.hostname in {ADDRESS, "localhost", "::1"} and parts.port in (self._port, forwarded)
+            is_plain = f"{parts.scheme}://{parts.netloc}" == origin and parts.scheme == "http"
+            return (
+                is_plain and parts.hostname in {ADDRESS, "localhost", "::1"} and parts.port in (self._port, forwarded)
+            )
         except ValueError:
             return False
 
@@ -166,13 +178,18 @@ class Server:
         page.send(json.dumps(description))
 
     def disconnect(self, page: _Connection) -> None:
-        """Remove a page; if it steered, the tool lets go, and the next page steers."""
+        """Remove a page; if it steered, the tool is released, and the next page steers."""
         if page is self.pages[0]:
             self._events.append(events.Release())
         self.pages.remove(page)
 
     def receive(self, page: _Connection, message: str | bytes) -> None:
-        """Process a message of a page; describe the fault of a message that is not valid to it."""
+        """Queue the event of a message, or reply with its fault.
+
+        Args:
+            page: the sender; events are ignored unless it steers.
+            message: see `events.parse_message`.
+        """
         try:
             event = events.parse_message(message)
         except (ValueError, RecursionError) as error:
@@ -232,8 +249,8 @@ class Server:
             self._picture, self._jpeg = picture, encode_jpeg(picture)
         state = self._state(pacing)
         for page in ready:
-            own = {"steers": page is self.pages[0], "readings": list(page.readings)}
-            header = json.dumps({**state, **own}, allow_nan=False).encode()
+            of_page = {"steers": page is self.pages[0], "readings": list(page.readings)}
+            header = json.dumps({**state, **of_page}, allow_nan=False).encode()
             jpeg = b"" if page.jpeg is self._jpeg else self._jpeg
             page.send(len(header).to_bytes(4, "big") + header + jpeg)
             page.jpeg = self._jpeg

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -25,13 +25,14 @@ from taichi_msm.runs.media import Picture
 from taichi_msm.runs.simulation import Simulation
 from taichi_msm.scene.scene import Scene
 from taichi_msm.scene.section import MAX_PROBES
+from taichi_msm.scene.tools import Probe
 from taichi_msm.solver.planning import plan_variant, with_time
 from taichi_msm.system import runtime
 from taichi_msm.system.process import available_threads
 from taichi_msm.view import events, overlay
 from taichi_msm.view.material import MAX_FACTOR, material_values, with_value
 from taichi_msm.view.recording import Captures, Film, count_probe_values
-from taichi_msm.view.tools import ForceControlledTool, PositionControlledTool, SheetPosition
+from taichi_msm.view.tools import ForceControlledTool, PositionControlledTool, SheetPosition, clear_start
 from taichi_msm.view.viewport import Viewport
 
 # Largest frame rate of a session, that of common screens [1/s].
@@ -71,7 +72,7 @@ class Session:
         scene: the scene; the attribute has the frames and the time step of the session.
         captures: receives saved files.
         arch: cpu, cuda or vulkan.
-        threads: number of CPU threads; None: one per core.
+        threads: number of CPU threads, by default one per core.
         play: whether the scene's own probes act too.
         progress: called often with the stage; an exception from it stops the session.
 
@@ -107,7 +108,8 @@ class Session:
         self._scene_probes = tuple(probe for probe in scene.probes if play or probe.clamp is not None)
         # Without outputs, their kernels are not compiled.
         self._plan = replace(plan, scene=scene.model_copy(update={"output": ()}))
-        self._force_tool, self._position_tool = _force_tool(plan), _position_tool(plan)
+        self._force_tool = _force_tool(plan, self._scene_probes)
+        self._position_tool = _position_tool(plan, self._scene_probes)
         first = next(probe for probe in scene.probes if probe.clamp is None)
         tool = self._position_tool if first.moved else self._force_tool
         assert tool is not None
@@ -248,8 +250,8 @@ class Session:
         Raises:
             FilesError: when it cannot be written.
         """
-        place, option = (self._captures.folder / "film.gif", "--out") if path is None else (path, "--record")
-        self._film = Film(place, option, self.scene.render, self.frame_rate, self.subframes, self._elapsed)
+        file, option = (self._captures.folder / "film.gif", "--out") if path is None else (path, "--record")
+        self._film = Film(file, option, self.scene.render, self.frame_rate, self.subframes, self._elapsed)
         self._film_path = path
         if path is not None:
             # A session that ends at once has a film, too.
@@ -419,7 +421,7 @@ class Session:
         session_tools = [tool for tool in plan.tools if tool.probe == len(self._scene_probes)]
         if any(path_problems(plan.scene, session_tools, plan.grid)):
             raise SceneError(
-                ["this tool cannot be held by position: its shaft leads down into the sheet; let it lead up"]
+                ["this tool cannot be position-controlled: its shaft leads down into the sheet; let it lead up"]
             )
         return plan
 
@@ -427,7 +429,7 @@ class Session:
         tool = self._position_tool if isinstance(self.tool, ForceControlledTool) else self._force_tool
         if tool is None:
             needs = "an instrument" if isinstance(self.tool, ForceControlledTool) else "a force"
-            self.show_notice(f"a tool that is held so needs {needs}; give a probe of the scene one")
+            self.show_notice(f"this control of the tool needs {needs}; add it to a probe of the scene")
             return
         try:
             plan = self._with_tool(tool)
@@ -510,7 +512,7 @@ def _require_usable(scene: Scene, *, play: bool) -> None:
     errors = {
         "image: missing; a session needs one, name it here or with --image": scene.image is None,
         "probes: empty; the tool takes its force from the first probe, add one": not scene.probes,
-        "probes: a clamp is no tool of a session; add a probe with a force": bool(scene.probes)
+        "probes: a clamp is not a tool of a session; add a probe with a force": bool(scene.probes)
         and all(probe.clamp is not None for probe in scene.probes),
         f"probes: {MAX_PROBES} leave no room for the tool; remove one, or leave out --play": play
         and len(scene.probes) == MAX_PROBES,
@@ -519,17 +521,19 @@ def _require_usable(scene: Scene, *, play: bool) -> None:
         raise SceneError([message for message, applies in errors.items() if applies])
 
 
-def _force_tool(plan: Plan) -> ForceControlledTool | None:
+def _force_tool(plan: Plan, played: Sequence[Probe]) -> ForceControlledTool | None:
     """Build the force-controlled tool; None if no probe has a force."""
     probe = next((probe for probe in plan.scene.probes if not probe.moved), None)
-    return ForceControlledTool(probe, plan.grid.frames_per_second) if probe else None
+    if probe is None:
+        return None
+    return ForceControlledTool(probe, plan.grid.frames_per_second, clear_start(probe, played, plan.scene))
 
 
-def _position_tool(plan: Plan) -> PositionControlledTool | None:
+def _position_tool(plan: Plan, played: Sequence[Probe]) -> PositionControlledTool | None:
     """Build the position-controlled tool; None if no probe has an instrument."""
     probes = sorted(plan.scene.probes, key=lambda probe: not probe.moved)
     probe = next((probe for probe in probes if probe.instrument is not None), None)
-    return PositionControlledTool(probe, plan) if probe else None
+    return None if probe is None else PositionControlledTool(probe, plan, clear_start(probe, played, plan.scene))
 
 
 def newtons(force: float) -> str:
@@ -538,7 +542,7 @@ def newtons(force: float) -> str:
 
 
 def length(metres: float) -> str:
-    """Format a length [m] in mm or m."""
-    if metres == 0 or 1e-7 <= metres < 1:
-        return f"{1e3 * metres:.3g} mm"
-    return f"{metres:.3g} m"
+    """Format a length [m] with three digits in um, mm or m."""
+    if 0 < metres < 0.9995e-5:
+        return f"{1e6 * metres:.3g} um"
+    return f"{metres:.3g} m" if metres >= 0.9995 else f"{1e3 * metres:.3g} mm"

@@ -5,9 +5,17 @@ from __future__ import annotations
 import math
 from collections import deque
 from collections.abc import Sequence
+from dataclasses import replace
+from itertools import product
 from typing import Any
 
+import numpy as np
+
 from taichi_msm.model.plan import Plan
+from taichi_msm.model.tool_force import control_points
+from taichi_msm.model.tools import Tool, build_tools, overlap
+from taichi_msm.scene.scene import Scene
+from taichi_msm.scene.sheet import Sheet
 from taichi_msm.scene.tools import Probe
 from taichi_msm.shapes import SHAPES
 
@@ -17,8 +25,58 @@ RISE_TIME_S = 0.2
 # Number of latest keyframes that determine the next frame; there may be a jump at its beginning.
 ACTIVE_KEYFRAMES = 4
 
+# Height of the tip above the sheet at rest when it does not press [tip radii].
+HOVER_HEIGHT_RADII = 1.0
+
 # Position on the sheet, fractions (across, down) of its size.
 SheetPosition = tuple[float, float]
+
+# Positions at which a tool may start, in order of preference.
+CENTRE = 0.5, 0.5
+STARTS: tuple[SheetPosition, ...] = (CENTRE, *product((0.1, 0.9), (0.1, 0.9)), *product((0.0, 1.0), (0.0, 1.0)))
+
+
+def clear_start(probe: Probe, played: Sequence[Probe], scene: Scene) -> SheetPosition:
+    """Return a start at which an idle tool does not intersect the tools that are played in its session.
+
+    Args:
+        probe: probe of the tool.
+        played: probes of the other tools.
+        scene: has the sheet and the duration of the motion.
+
+    Returns:
+        The first such position of `STARTS`; the centre if there is none, or if the tool has no instrument.
+    """
+    if probe.instrument is None:
+        return CENTRE
+    others = [_capsule(each, scene.sheet) for each in played if each.instrument is not None]
+    for start in STARTS:
+        hovering = Probe(path=((0.0, *start, _hover_height(probe)),), instrument=probe.instrument)
+        if all(overlap((_capsule(hovering, scene.sheet), each), scene.time.duration) is None for each in others):
+            return start
+    return CENTRE
+
+
+def _capsule(probe: Probe, sheet: Sheet) -> Tool:
+    """Build a capsule that moves with the instrument of a probe, on the sheet at rest if it is force-controlled."""
+    assert probe.instrument is not None
+    capsule = probe.instrument.model_copy(update={"radius": probe.instrument.outer_radius, "plate": None})
+    (tool,) = build_tools([Probe(path=probe.path or ((0.0, *CENTRE, 0.0),), instrument=capsule)], sheet)
+    if probe.path is None:
+        times, points = control_points(probe, sheet)
+        heights = np.full(len(times), tool.tip_centres[0, 2])
+        tool = replace(tool, times=times, tip_centres=np.column_stack([points, heights]))
+    return tool
+
+
+def _hover_height(probe: Probe) -> float:
+    assert probe.instrument is not None
+    return _rounded(HOVER_HEIGHT_RADII * probe.instrument.outer_radius)
+
+
+def _rounded(height: float) -> float:
+    """Round a height to the nine significant digits of a scene file."""
+    return float(f"{height:.9g}")
 
 
 class ForceControlledTool:
@@ -31,22 +89,24 @@ class ForceControlledTool:
     Args:
         probe: has the force, falloff and offset.
         frame_rate: frames per second of the session.
+        start: position before the first press.
 
     Attributes:
         strength: force of a press [% of the full force].
         percent: current force [% of the full force]; negative when pulling.
+        position: current control point, fractions (across, down) of the sheet.
     """
 
-    def __init__(self, probe: Probe, frame_rate: float) -> None:
+    def __init__(self, probe: Probe, frame_rate: float, start: SheetPosition = CENTRE) -> None:
         self.strength = 100.0
         self.probe = probe
-        self._frame_rate = frame_rate
+        self._frame_rate, self._start = frame_rate, start
         self.reset()
 
     def reset(self) -> None:
         """Discard the recorded keyframes and the pending actions."""
         self.percent = 0.0
-        self.position: SheetPosition = (0.5, 0.5)
+        self.position = self._start
         self._target = self.position
         self._direction = 0
         # Presses, with position and direction (1 to push, -1 to pull), and releases (None).
@@ -69,7 +129,12 @@ class ForceControlledTool:
         self.strength = min(100.0, max(0.0, strength))
 
     def press(self, position: SheetPosition, direction: int) -> None:
-        """Press in direction 1, or pull in direction -1; an engaged tool is released first."""
+        """Press or pull; an engaged tool is released first.
+
+        Args:
+            position: fractions (across, down) of the sheet, clamped to it.
+            direction: 1 to press, -1 to pull.
+        """
         if len(self._pending) > 1 and self._pending[-1] is None:
             # Discard an earlier click without effect yet, such as in a paused session.
             self._pending.pop()
@@ -108,7 +173,7 @@ class ForceControlledTool:
             change = target - self.percent
             self.percent = target if abs(change) <= limit else self.percent + math.copysign(limit, change)
             self._move_to_target(end)
-        extend(self._load, (end, self.percent))
+        _append_keyframe(self._load, (end, self.percent))
         return self._as_probe(self._load[-ACTIVE_KEYFRAMES:], self._at[-ACTIVE_KEYFRAMES:], end)
 
     def recorded_probe(self, frame: int) -> Probe:
@@ -119,7 +184,7 @@ class ForceControlledTool:
         self.position = self._target
         if self._at[-1][0] == time:
             self._at.pop()
-        extend(self._at, (time, *self.position))
+        _append_keyframe(self._at, (time, *self.position))
 
     def _as_probe(
         self, load: Sequence[tuple[float, float]], at: Sequence[tuple[float, float, float]], end: float
@@ -130,7 +195,7 @@ class ForceControlledTool:
         return self.probe.model_copy(update={"load": tuple(load), "at": tuple(at)})
 
 
-def extend(keys: list[Any], key: tuple[float, ...]) -> None:
+def _append_keyframe(keys: list[Any], key: tuple[float, ...]) -> None:
     """Append a keyframe, a time [s] followed by values, and remove the middle one of three with equal values."""
     if len(keys) > 1 and keys[-1][1:] == keys[-2][1:] == key[1:]:
         keys.pop()
@@ -142,9 +207,6 @@ def on_sheet(position: SheetPosition) -> SheetPosition:
     across, down = (round(min(1.0, max(0.0, fraction)), 6) for fraction in position)
     return across, down
 
-
-# Height of the tip above the sheet at rest when it does not press [tip radii].
-HOVER_HEIGHT_RADII = 1.0
 
 # Largest depth of the tip and height of a grip [tip radii]; also limited to a quarter of the sheet's shorter side.
 MAX_DEPTH_RADII = 5.0
@@ -165,23 +227,26 @@ class PositionControlledTool:
     Args:
         probe: has the instrument, and the friction if it is set; in quasi-static sessions rough or none.
         plan: of the session.
+        start: position before the pointer moves.
 
     Attributes:
         strength: depth of a press [% of the largest depth]; negative to lift a grip.
+        position: current position of the tip, fractions (across, down) of the sheet.
+        target: position that the tip moves to.
         height: current height of the lowest point of the tip above the sheet at rest [m].
         grid: of the session; a change of the material changes its step.
     """
 
-    def __init__(self, probe: Probe, plan: Plan) -> None:
+    def __init__(self, probe: Probe, plan: Plan, start: SheetPosition = CENTRE) -> None:
         assert probe.instrument is not None
         self.grid, self._sheet, self._radius = plan.grid, plan.scene.sheet, probe.instrument.outer_radius
         self._stride = SHAPES[probe.instrument.shape].max_stride * self._radius
         self._max_depth = min(MAX_DEPTH_RADII * self._radius, 0.25 * min(self._sheet.size))
-        self._hover_height = _rounded(HOVER_HEIGHT_RADII * self._radius)
+        self._start, self._hover_height = start, _hover_height(probe)
         friction = probe.friction if "friction" in probe.model_fields_set else DEFAULT_FRICTION
         if plan.scene.time.at_rest and friction != "rough":
             friction = 0.0
-        self._probe = Probe(path=((0.0, 0.5, 0.5, self._hover_height),), friction=friction, instrument=probe.instrument)
+        self._probe = Probe(path=((0.0, *start, self._hover_height),), friction=friction, instrument=probe.instrument)
         # The default depth is the radius of the tip.
         self.strength = min(100.0, 100 * self._radius / self._max_depth)
         self._press_strength = self.strength
@@ -189,8 +254,7 @@ class PositionControlledTool:
 
     def reset(self) -> None:
         """Discard the recorded keyframes, and return to the initial position."""
-        self.position: SheetPosition = (0.5, 0.5)
-        self.target = self.position
+        self.position = self.target = self._start
         self.height = self._hover_height
         self.engaged = self._grip_requested = False
         # Start of the current grip, and intervals of earlier grips [s].
@@ -218,7 +282,12 @@ class PositionControlledTool:
         self.strength = min(100.0, max(-100.0 if self._grip_requested else 0.0, strength))
 
     def press(self, position: SheetPosition, direction: int) -> None:
-        """Press in direction 1, or grip in direction -1."""
+        """Press or grip.
+
+        Args:
+            position: fractions (across, down) of the sheet, clamped to it.
+            direction: 1 to press, -1 to grip.
+        """
         self.release()
         self.engaged, self._grip_requested, self._press_strength = True, direction < 0, self.strength
         self.move(position)
@@ -244,7 +313,7 @@ class PositionControlledTool:
             self._grip_start = begin
         self._move_tip()
         key = end, *self.position, self.height
-        extend(self._path, key)
+        _append_keyframe(self._path, key)
         # The end of an active grip is unknown, and set beyond the end of any session.
         grip = NO_GRIP if self._grip_start is None else (self._grip_start, self._grip_start + 1e9)
         return self._probe.model_copy(update={"path": (key,), "grip": (grip,)})
@@ -277,8 +346,3 @@ class PositionControlledTool:
     def _time(self, frame: int) -> float:
         """Return the time of a frame [s], bit-identical to that of its step, so that the tip is exactly at its key."""
         return self.grid.time(frame * self.grid.steps_per_frame)
-
-
-def _rounded(height: float) -> float:
-    """Round a height to the nine significant digits of a scene file."""
-    return float(f"{height:.9g}")

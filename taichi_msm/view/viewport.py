@@ -23,6 +23,10 @@ class Viewport:
     Args:
         renderer: has the initial settings in its scene.
         play: whether to follow a moving camera of the scene; otherwise it stays at its initial pose.
+
+    Attributes:
+        render: current drawing settings.
+        view: current pose and projection of the main camera.
     """
 
     def __init__(self, renderer: Renderer, *, play: bool = False) -> None:
@@ -61,13 +65,18 @@ class Viewport:
         return self.render
 
     def turn(self, right: float, down: float) -> None:
-        """Orbit the camera as if the near side of the tissue were dragged [px]; the height is half a turn."""
+        """Orbit the camera as if the near side of the tissue were dragged; the picture's height is half a turn.
+
+        Args:
+            right: distance to the right [px].
+            down: distance downwards [px].
+        """
         angle = math.pi / self.render.size[1]
         scene = self._renderer.scene.model_copy(update={"render": self.render})
         self.set_camera(orbit_camera(pinhole(scene, self._time), -right * angle, down * angle))
 
     def toggle_light(self) -> None:
-        """Toggle the shading of the scene, or a headlight if the scene has none."""
+        """Toggle the shading of the scene, or a headlight if the scene has no shading."""
         scene_shading = self._renderer.scene.render.shading
         shading = scene_shading if scene_shading != "none" else "headlight"
         update = {"shading": "none" if self.render.shading != "none" else shading}
@@ -78,7 +87,15 @@ class Viewport:
         self.render = self.render.model_copy(update={"wireframe": not self.render.wireframe})
 
     def draw(self, positions: NDArray[Any], instruments: Sequence[Solid] = ()) -> Picture:
-        """Return the picture of the sheet at positions [m], shape (rows, cols, 3), and of instruments."""
+        """Draw the sheet and the instruments.
+
+        Args:
+            positions: of the mass points [m], shape (rows, cols, 3).
+            instruments: placed in the scene.
+
+        Returns:
+            Picture, shape (height, width, 3).
+        """
         return self._renderer.draw(Shot(positions, self.view, instruments), self.render)
 
     def project(self, point: NDArray[np.floating]) -> tuple[float, float] | None:

@@ -1,4 +1,4 @@
-"""The shipped scenes without a clone of the repository."""
+"""The command `example`."""
 
 from __future__ import annotations
 
@@ -11,9 +11,7 @@ from tests.conftest import Program
 from tests.golden import Messages
 
 
-def test_every_shipped_scene_is_listed_and_written_with_its_pictures(
-    root: Path, tmp_path: Path, program: Program, message: Messages
-) -> None:
+def test_shipped_scenes_and_their_pictures(root: Path, tmp_path: Path, program: Program, message: Messages) -> None:
     listed = program("example").stdout
     message(listed)
     names = [line.split()[0] for line in listed.splitlines()]
@@ -29,27 +27,27 @@ def test_every_shipped_scene_is_listed_and_written_with_its_pictures(
         map(str, (tmp_path / "tracking/sweeps/textures").iterdir())
     )
     plan = load_plan(tmp_path / "tumour/tumour.yaml")
-    assert Path(str(plan.scene.image)).is_relative_to(tmp_path), "and its maps are there"
+    assert Path(str(plan.scene.image)).is_relative_to(tmp_path)
 
 
-def test_scenes_share_pictures_and_nothing_is_overwritten(tmp_path: Path, program: Program, message: Messages) -> None:
-    here = str(tmp_path)
-    assert program("example", "press", here).returncode == program("example", "drag", here).returncode == 0
-    again = program("example", "press", here)
+def test_no_file_is_overwritten(tmp_path: Path, program: Program, message: Messages) -> None:
+    directory = str(tmp_path)
+    assert program("example", "press", directory).returncode == program("example", "drag", directory).returncode == 0
+    again = program("example", "press", directory)
     assert again.returncode == 4
     message(again.stderr, "press.yaml")
-    (tmp_path / "textures" / "mucosa.png").write_text("mine")
-    other = program("example", "grasp", here)
-    assert other.returncode == 4
-    message(other.stderr, "mucosa.png")
-    assert (tmp_path / "textures" / "mucosa.png").read_text() == "mine"
+    (tmp_path / "textures" / "mucosa.png").write_text("another picture")
+    grasp = program("example", "grasp", directory)
+    assert grasp.returncode == 4
+    message(grasp.stderr, "mucosa.png")
+    assert (tmp_path / "textures" / "mucosa.png").read_text() == "another picture"
     assert not (tmp_path / "grasp.yaml").exists()
     unknown = program("example", "pres")
     assert unknown.returncode == 2
     message(unknown.stderr, "press")
 
 
-def test_the_wheel_has_the_scenes(root: Path) -> None:
+def test_wheel_contains_the_scenes(root: Path) -> None:
     text = (root / "pyproject.toml").read_text(encoding="utf-8")
     assert '[tool.hatch.build.targets.wheel.force-include]\n"scenes" = "taichi_msm/scenes"\n' in text
     assert example.scenes_folder() == root / "scenes"

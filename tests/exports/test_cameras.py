@@ -1,18 +1,16 @@
-"""Exports of a camera: which one, which a format can describe, tables of its tracks, and TAPVid-3D.
+"""Exports of a camera by its name, CSV tables of its tracks, and TAPVid-3D.
 
-What TAPVid-3D's own evaluation reads of our files.
-
-Its requirements, restated (google-deepmind/tapnet, tapnet/tapvid3d, at c2cbab8 where nothing else is said):
+Requirements of TAPVid-3D's evaluation (google-deepmind/tapnet, tapnet/tapvid3d, at c2cbab8 unless stated otherwise):
 
 - evaluation/evaluate_model.py, lines 191 to 197: an .npz with images_jpeg_bytes, queries_xyt, tracks_XYZ, visibility
   and fx_fy_cx_cy; lines 108 to 112: each image is a JPEG that Pillow opens; lines 237 to 244: visibility is true where
-  a point is seen, tracks and visibility have the order t, n, and the columns of queries, reversed, are t, y, x;
+  a point is visible, tracks and visibility have the order t, n, and the columns of queries, reversed, are t, y, x;
 - evaluation/metrics.py, lines 23 to 29: the thresholds are the depth, the last column of tracks, over the focal length
   in pixels; lines 205 to 211: tracks are read in the frame of their query;
 - annotation_generation/adt_utils.py at 00f244e, lines 109 to 118: a point is in the pixel of row floor(y) and column
-  floor(x), with x = fx X / Z + cx, so that pixels are counted from the picture's corner;
-- colab/load_and_visualize_tapvid3d_samples.ipynb, lines 166 to 174: np.load without pickle; extrinsics_w2c if it is
-  there, README.md, line 108: from the world to the camera.
+  floor(x), with x = fx X / Z + cx, so that pixels count from the picture's corner;
+- colab/load_and_visualize_tapvid3d_samples.ipynb, lines 166 to 174: np.load without pickle; optional extrinsics_w2c,
+  README.md, line 108: from the world to the camera.
 """
 
 from __future__ import annotations
@@ -36,17 +34,17 @@ from tests.outputs import files
 
 
 def describe(folder: Path, **changes: Any) -> None:
-    """Change what a run has written of its camera; None removes a key."""
+    """Change keys of camera.json; None removes a key."""
     path = folder / "camera.json"
-    described = {**json.loads(path.read_text()), **changes}
-    path.write_text(json.dumps({name: value for name, value in described.items() if value is not None}))
+    camera = {**json.loads(path.read_text()), **changes}
+    path.write_text(json.dumps({name: value for name, value in camera.items() if value is not None}))
 
 
 FRAMES, TRACKS, WIDTH, HEIGHT = 5, 36, 320, 256
 
 
 def alone(stereo: Path, side: str) -> Path:
-    """The same run with one camera, as one without a name."""
+    """Return the run with one camera, which has no name."""
     out = stereo.parent / side
     shutil.copytree(stereo, out, ignore=shutil.ignore_patterns("left", "right"))
     shutil.copytree(stereo / side, out, dirs_exist_ok=True)
@@ -63,7 +61,7 @@ def single(stereo: Path) -> Path:
 
 
 @pytest.mark.parametrize("name", ["tapvid", "tapvid3d", "csv"])
-def test_a_camera_is_chosen_by_its_name(name: str, stereo: Path, program: Program) -> None:
+def test_camera_by_name(name: str, stereo: Path, program: Program) -> None:
     for side in ("left", "right"):
         done = program("export", str(stereo), "--format", name, "--camera", side, "--out", str(stereo.parent / "out"))
         assert (done.returncode, done.stderr) == (0, "")
@@ -75,7 +73,7 @@ def test_a_camera_is_chosen_by_its_name(name: str, stereo: Path, program: Progra
             assert len(got["tapvid.pkl"]) == len(expected["tapvid.pkl"]) + len("stereo") - len(side)
 
 
-def test_a_choice_that_is_none_is_told_of(stereo: Path, program: Program, message: Messages) -> None:
+def test_invalid_camera(stereo: Path, program: Program, message: Messages) -> None:
     for camera in ([], ["--camera", "lift"]):
         done = program("export", str(stereo), "--format", "tapvid", *camera)
         assert (done.returncode, done.stdout) == (2, "")
@@ -83,27 +81,23 @@ def test_a_choice_that_is_none_is_told_of(stereo: Path, program: Program, messag
     for folder, name in ((alone(stereo, "left"), "tapvid"), (stereo, "gltf"), (stereo, "stir")):
         with message.raises(ArgumentError, "camera"):
             export(folder, name, camera="left")
-
-
-def test_what_a_camera_lacks_is_named(stereo: Path, message: Messages) -> None:
     (stereo / "right" / "tracks.npz").unlink()
     with message.raises(FilesError, "tracks"):
         export(stereo, "tapvid", camera="right")
-    export(stereo, "tapvid", camera="left")
-    # Surfaces have no camera to choose.
+    # Surfaces are independent of the cameras.
     assert export(stereo, "gltf").files == ["index.csv", "surface.glb"]
 
 
 @pytest.mark.parametrize(
     ("name", "formats"), [("left", ["tapvid", "tapvid3d", "csv"]), ("", ["obj"])], ids=["camera", "record"]
 )
-def test_a_link_on_the_way_is_not_followed(name: str, formats: list[str], stereo: Path, message: Messages) -> None:
-    """Be it the folder of a camera or the record: both may lead to the results of another run."""
-    other = stereo.with_name("other")
-    shutil.copytree(stereo, other)
+def test_linked_camera_folder_or_record(name: str, formats: list[str], stereo: Path, message: Messages) -> None:
+    """Links to the results of another run."""
+    second = stereo.with_name("second")
+    shutil.copytree(stereo, second)
     link = stereo / (name or "run.json")
     shutil.rmtree(link) if name else link.unlink()
-    link.symlink_to(other / link.name)
+    link.symlink_to(second / link.name)
     for each in formats:
         with message.raises(FilesError, link.name):
             export(stereo, each, camera=name or None)
@@ -115,20 +109,18 @@ WRONG: dict[str, dict[str, Any]] = {
     "distorted": {"distortion": [-0.3, 0.1, 0, 0, 0, 0, 0, 0], "model": "pinhole"},
     "fisheye": {"distortion": [0, 0, 0, 0], "model": "fisheye"},
     "no perspective": {"intrinsics": None, "pose": None},
-    "2 x 2": {"intrinsics": [[1, 0], [0, 1]]},
     "no focal length": {"intrinsics": [[0, 0, 1], [0, 1, 0], [0, 0, 1]]},
     "too few poses": {"poses": [[[1, 0, 0, 0]] * 3]},
-    "no pose": {"pose": "here"},
 }
 
 
 @pytest.mark.parametrize("name", WRONG)
-def test_cameras_that_cannot_be_described_are_refused(name: str, single: Path, message: Messages) -> None:
+def test_tapvid3d_rejects_a_camera(name: str, single: Path, message: Messages) -> None:
     describe(single, **WRONG[name])
     with message.raises(ArgumentError if list(WRONG).index(name) < 3 else FilesError, "camera.json"):
         export(single, "tapvid3d")
     assert not (single / "export-tapvid3d").exists()
-    # What has no calibration takes any camera.
+    # Formats without a calibration export any camera.
     export(single, "tapvid")
 
 
@@ -141,50 +133,55 @@ def column(path: Path, *names: str) -> np.ndarray[Any, Any]:
     return np.array([[float(row[name] or "nan") for name in names] for row in rows(path)])
 
 
-def test_every_number_comes_back(single: Path) -> None:
-    with np.load(single / "tracks.npz") as archive:
-        made = dict(archive)
-    made["points"][7, 2], made["occluded"][7, 2] = np.nan, True
-    np.savez(single / "tracks.npz", **made)
+def test_csv_round_trip(single: Path) -> None:
+    arrays = tracks(single)
+    arrays["points"][7, 2], arrays["occluded"][7, 2] = np.nan, True
+    np.savez(single / "tracks.npz", **arrays)
     done = export(single, "csv")
     assert (done.files, done.notes) == (["forces.csv", "index.csv", "tracks.csv"], [])
-    tracks = done.directory / "tracks.csv"
-    assert list(rows(tracks)[0]) == [
+    table = done.directory / "tracks.csv"
+    assert list(rows(table)[0]) == [
         *("run", "time", "point", "across", "down", "x", "y", "occluded", "position_x", "position_y", "position_z")
     ]
     shape = FRAMES, TRACKS, -1
-    np.testing.assert_array_equal(column(tracks, "point").reshape(shape)[..., 0], [np.arange(TRACKS)] * FRAMES)
-    np.testing.assert_array_equal(column(tracks, "time").reshape(shape)[:, 0, 0], np.arange(FRAMES) / 10)
+    np.testing.assert_array_equal(column(table, "point").reshape(shape)[..., 0], [np.arange(TRACKS)] * FRAMES)
+    np.testing.assert_array_equal(column(table, "time").reshape(shape)[:, 0, 0], np.arange(FRAMES) / 10)
     for names, expected in (
-        (("across", "down"), np.tile(made["coordinates"][:, None], (1, FRAMES, 1))),
-        (("x", "y"), made["points"]),
-        (("occluded",), made["occluded"][..., None]),
-        (("position_x", "position_y", "position_z"), made["position"]),
+        (("across", "down"), np.tile(arrays["coordinates"][:, None], (1, FRAMES, 1))),
+        (("x", "y"), arrays["points"]),
+        (("occluded",), arrays["occluded"][..., None]),
+        (("position_x", "position_y", "position_z"), arrays["position"]),
     ):
-        found = column(tracks, *names).reshape(shape).transpose(1, 0, 2)
-        np.testing.assert_array_equal(found.astype(np.float32), expected)
-    assert rows(tracks)[2 * TRACKS + 7]["x"] == "", "behind the eye"
+        values = column(table, *names).reshape(shape).transpose(1, 0, 2)
+        np.testing.assert_array_equal(values.astype(np.float32), expected)
+    assert rows(table)[2 * TRACKS + 7]["x"] == "", "behind the eye"
     forces = rows(done.directory / "forces.csv")
     assert {row.pop("run") for row in forces} == {"000000"}
     assert forces == rows(single / "forces.csv")
 
 
-def test_runs_are_told_apart_by_their_numbers(single: Path, message: Messages) -> None:
-    """And one without forces is missing from their table."""
-    other = single.parent / "other"
+def test_csv_of_several_runs(single: Path, message: Messages) -> None:
+    """A run without forces is missing from their table."""
+    second = single.parent / "second"
     export(single, "csv", single / "alone")
-    shutil.copytree(single, other)
-    (other / "forces.csv").unlink()
-    done = export([other, single], "csv", single.parent / "all")
+    shutil.copytree(single, second)
+    (second / "forces.csv").unlink()
+    done = export([second, single], "csv", single.parent / "all")
     message(done.notes, "forces")
     for name in ("tracks.csv", "forces.csv"):
-        found, expected = rows(done.directory / name), rows(single / "alone" / name)
+        exported, expected = rows(done.directory / name), rows(single / "alone" / name)
         for run in ("000000", "000001") if name == "tracks.csv" else ("000001",):
-            part = [row for row in found if row["run"] == run]
+            part = [row for row in exported if row["run"] == run]
             assert [{**row, "run": "000000"} for row in part] == expected
 
 
-def test_forces_have_no_camera_to_choose(stereo: Path) -> None:
+def test_csv_without_forces_or_tracks(stereo: Path, single: Path, message: Messages) -> None:
+    (single / "forces.csv").unlink()
+    assert export(single, "csv").files == ["index.csv", "tracks.csv"]
+    (single / "tracks.npz").unlink()
+    with message.raises(FilesError, "forces"):
+        export(single, "csv")
+    # Forces are independent of the cameras.
     record = json.loads((stereo / "run.json").read_text())
     record["scene"]["output"].remove("tracks")
     (stereo / "run.json").write_text(json.dumps(record))
@@ -193,26 +190,17 @@ def test_forces_have_no_camera_to_choose(stereo: Path) -> None:
     assert export(stereo, "csv").files == ["forces.csv", "index.csv"]
 
 
-def test_one_of_both_is_needed(single: Path, message: Messages) -> None:
-    (single / "forces.csv").unlink()
-    assert export(single, "csv").files == ["index.csv", "tracks.csv"]
-    (single / "tracks.npz").unlink()
-    with message.raises(FilesError, "forces"):
-        export(single, "csv")
-
-
-def test_damaged_tables_are_one_line(single: Path, message: Messages) -> None:
-    whole = (single / "forces.csv").read_text()
-    header = whole.partition("\n")[0]
-    for text in ("", "time\n0\n", f"{header}\n0,0,0\n", f"{header}\n0,0,0,0,0,0,0,=1+1\n", "\xff"):
-        (single / "forces.csv").write_bytes(text.encode("latin1"))
+def test_damaged_tables(single: Path, message: Messages) -> None:
+    text = (single / "forces.csv").read_text()
+    header = text.partition("\n")[0]
+    for damaged in ("", f"{header}\n0,0,0\n", f"{header}\n0,0,0,0,0,0,0,=1+1\n"):
+        (single / "forces.csv").write_text(damaged)
         with message.raises(FilesError, "forces.csv"):
             export(single, "csv")
-    (single / "forces.csv").write_text(whole)
-    with np.load(single / "tracks.npz") as archive:
-        made = dict(archive)
-    del made["position"]
-    np.savez(single / "tracks.npz", **made)
+    (single / "forces.csv").write_text(text)
+    arrays = tracks(single)
+    del arrays["position"]
+    np.savez(single / "tracks.npz", **arrays)
     with message.raises(FilesError, "tracks.npz"):
         export(single, "csv")
     assert not (single / "export-csv").exists()
@@ -228,61 +216,61 @@ def tracks(folder: Path) -> dict[str, Any]:
         return dict(archive)
 
 
-def test_tracks_and_frames_come_back(single: Path) -> None:
+def test_tapvid3d_round_trip(single: Path) -> None:
     done = export([single, single], "tapvid3d", single / "all")
     assert (done.files, done.notes) == (["000000.npz", "000001.npz", "index.csv"], [])
-    found, expected = read(done.directory / "000000.npz"), tracks(single)
-    assert found["tracks_XYZ"].shape == (FRAMES, TRACKS, 3)
-    np.testing.assert_array_equal(read(done.directory / "000001.npz")["tracks_XYZ"], found["tracks_XYZ"])
-    assert found["visibility"].shape == (FRAMES, TRACKS)
-    assert found["visibility"].dtype == np.bool_
-    np.testing.assert_array_equal(~found["visibility"].T, expected["occluded"])
-    x, y, depth = np.moveaxis(found["tracks_XYZ"], -1, 0)
+    exported, expected = read(done.directory / "000000.npz"), tracks(single)
+    assert exported["tracks_XYZ"].shape == (FRAMES, TRACKS, 3)
+    np.testing.assert_array_equal(read(done.directory / "000001.npz")["tracks_XYZ"], exported["tracks_XYZ"])
+    assert exported["visibility"].shape == (FRAMES, TRACKS)
+    assert exported["visibility"].dtype == np.bool_
+    np.testing.assert_array_equal(~exported["visibility"].T, expected["occluded"])
+    x, y, depth = np.moveaxis(exported["tracks_XYZ"], -1, 0)
     assert (depth > 0.3).all(), "forward is positive"
-    fx, fy, cx, cy = found["fx_fy_cx_cy"]
-    seen = np.stack([fx * x / depth + cx, fy * y / depth + cy], axis=-1).transpose(1, 0, 2)
-    # Places and pixels were rounded to single precision.
-    np.testing.assert_allclose(seen, expected["points"], rtol=0, atol=1e-4)
-    assert found["images_jpeg_bytes"].shape == (FRAMES,)
-    for frame, data in enumerate(found["images_jpeg_bytes"]):
+    fx, fy, cx, cy = exported["fx_fy_cx_cy"]
+    pixels = np.stack([fx * x / depth + cx, fy * y / depth + cy], axis=-1).transpose(1, 0, 2)
+    # Positions and pixels are rounded to single precision.
+    np.testing.assert_allclose(pixels, expected["points"], rtol=0, atol=1e-4)
+    assert exported["images_jpeg_bytes"].shape == (FRAMES,)
+    for frame, data in enumerate(exported["images_jpeg_bytes"]):
         with Image.open(io.BytesIO(data)) as image:
             assert (image.format, image.size, image.mode) == ("JPEG", (WIDTH, HEIGHT), "RGB")
             drawn = np.asarray(Image.open(single / f"frames/{frame:04}.png"))
             assert np.abs(np.asarray(image).astype(int) - drawn).mean() < 2, "grey levels"
 
 
-def test_a_query_is_the_first_sight_of_its_point(single: Path, message: Messages) -> None:
-    made = tracks(single)
-    made["occluded"][3, :2] = True
-    made["occluded"][4] = True
-    made["points"][4, 1] = np.nan
-    np.savez(single / "tracks.npz", **made)
+def test_tapvid3d_queries(single: Path, message: Messages) -> None:
+    arrays = tracks(single)
+    arrays["occluded"][3, :2] = True
+    arrays["occluded"][4] = True
+    arrays["points"][4, 1] = np.nan
+    np.savez(single / "tracks.npz", **arrays)
     done = export(single, "tapvid3d")
     message(done.notes, "1 of 36")
-    found = read(done.directory / "000000.npz")
-    assert found["tracks_XYZ"].shape == (FRAMES, TRACKS - 1, 3)
-    assert found["queries_xyt"].shape == (TRACKS - 1, 3)
-    t, y, x = np.round(found["queries_xyt"][:, ::-1]).astype(int).T
+    exported = read(done.directory / "000000.npz")
+    assert exported["tracks_XYZ"].shape == (FRAMES, TRACKS - 1, 3)
+    assert exported["queries_xyt"].shape == (TRACKS - 1, 3)
+    t, y, x = np.round(exported["queries_xyt"][:, ::-1]).astype(int).T
     np.testing.assert_array_equal(t, [0, 0, 0, 2, *[0] * 31])
-    assert found["visibility"][t, np.arange(TRACKS - 1)].all()
-    kept = np.delete(made["points"], 4, axis=0)
-    np.testing.assert_array_equal(found["queries_xyt"][:, :2], kept[np.arange(TRACKS - 1), t])
+    assert exported["visibility"][t, np.arange(TRACKS - 1)].all()
+    kept = np.delete(arrays["points"], 4, axis=0)
+    np.testing.assert_array_equal(exported["queries_xyt"][:, :2], kept[np.arange(TRACKS - 1), t])
     assert (x < WIDTH).all()
     assert (y < HEIGHT).all()
 
 
-def test_the_axes_are_those_of_the_camera_in_each_frame(single: Path) -> None:
+def test_tapvid3d_of_a_moving_camera(single: Path) -> None:
     angle = 0.1 * np.arange(FRAMES)
     poses = np.tile(np.eye(3, 4), (FRAMES, 1, 1))
     poses[:, 0, 0] = poses[:, 1, 1] = np.cos(angle)
     poses[:, 1, 0], poses[:, 0, 1] = np.sin(angle), -np.sin(angle)
     poses[:, 2, 3] = 1 + angle
-    # Of a calibrated camera all coefficients may be written, and be 0.
+    # The coefficients of a calibrated camera may all be 0.
     describe(single, poses=poses.tolist(), distortion=[0.0] * 8, model="pinhole")
-    found, world = read(export(single, "tapvid3d").directory / "000000.npz"), tracks(single)["position"]
-    np.testing.assert_array_equal(found["extrinsics_w2c"][:, :3], poses)
-    np.testing.assert_array_equal(found["extrinsics_w2c"][:, 3], [[0, 0, 0, 1]] * FRAMES)
+    exported, world = read(export(single, "tapvid3d").directory / "000000.npz"), tracks(single)["position"]
+    np.testing.assert_array_equal(exported["extrinsics_w2c"][:, :3], poses)
+    np.testing.assert_array_equal(exported["extrinsics_w2c"][:, 3], [[0, 0, 0, 1]] * FRAMES)
     for frame in range(FRAMES):
         points = np.column_stack([world[:, frame], np.ones(TRACKS)]).astype(float)
-        expected = (found["extrinsics_w2c"][frame] @ points.T).T[:, :3]
-        np.testing.assert_allclose(found["tracks_XYZ"][frame], expected, rtol=0, atol=1e-15)
+        expected = (exported["extrinsics_w2c"][frame] @ points.T).T[:, :3]
+        np.testing.assert_allclose(exported["tracks_XYZ"][frame], expected, rtol=0, atol=1e-15)

@@ -1,6 +1,6 @@
-"""What the loaders of EndoNeRF and EndoGaussian read of our files.
+"""EndoNeRF export, decoded as by the loaders of EndoNeRF and EndoGaussian.
 
-Their requirements, restated (med-air/EndoNeRF at 5201b1e, yifliu3/EndoGaussian at d7aad82):
+Their requirements (med-air/EndoNeRF at 5201b1e, yifliu3/EndoGaussian at d7aad82):
 
 - load_llff.py, lines 97 to 200, and endo_loader.py, lines 170 to 204: poses_bounds.npy has 17 numbers a frame, a
   matrix 3 x 5 whose last column is height, width and focal length, and two bounds; images, depth and masks have a .png
@@ -46,7 +46,7 @@ def load(folder: Path) -> tuple[Array, Array, list[Array], list[Array], list[Arr
     return poses, bounds, images, masks, [each.astype(float) for each in pictures["depth"]]
 
 
-def test_what_the_loaders_read(labelled_in_motion: Path, tmp_path: Path) -> None:
+def test_loaders_of_endonerf_and_endogaussian(labelled_in_motion: Path, tmp_path: Path) -> None:
     run = labelled_in_motion
     done = export(run, "endonerf", tmp_path / "out")
     poses, bounds, images, masks, depths = load(done.directory)
@@ -63,8 +63,8 @@ def test_what_the_loaders_read(labelled_in_motion: Path, tmp_path: Path) -> None
         np.testing.assert_array_equal(masks[frame], instrument == 0)
         depth = np.array(Image.open(run / f"depth/{frame:04}.tiff"))
         np.testing.assert_allclose(depths[frame] * UNIT, depth, atol=UNIT * 0.501)
-        shown = depth[depth > 0]
-        np.testing.assert_allclose(bounds[frame] * UNIT, [shown.min(), shown.max()], rtol=1e-6)
+        on_sheet = depth[depth > 0]
+        np.testing.assert_allclose(bounds[frame] * UNIT, [on_sheet.min(), on_sheet.max()], rtol=1e-6)
         assert 0.02 < (masks[frame] == 0).mean() < 0.5
         # Tracked points, in the world of the loaders: the first camera's, right, up and backward.
         points = tracks["position"][:, frame].astype(float) @ first[:, :3].T + first[:, 3]
@@ -78,16 +78,16 @@ def test_what_the_loaders_read(labelled_in_motion: Path, tmp_path: Path) -> None
         # EndoNeRF's rays end on the same points.
         rays = np.stack([(i - WIDTH / 2) / 45, -(j - HEIGHT / 2) / 45, -np.ones_like(i)], axis=-1)
         ends = pose[:, 3] + depths[frame][..., None] * (rays @ pose[:, :3].T)
-        seen = ~tracks["occluded"][:, frame]
-        column, row = np.rint(pixels[seen]).astype(int).T
+        visible = ~tracks["occluded"][:, frame]
+        column, row = np.rint(pixels[visible]).astype(int).T
         # A pixel's middle is up to 0.71 px from the point, 0.011 of its depth of 0.5 m; the sheet is tilted.
-        assert seen.sum() > 5
-        assert np.linalg.norm(ends[row, column] - points[seen], axis=-1).max() * UNIT < 0.02
+        assert visible.sum() > 5
+        assert np.linalg.norm(ends[row, column] - points[visible], axis=-1).max() * UNIT < 0.02
     assert any("0.01 mm" in note for note in done.notes)
     assert any("640 x 512" in note for note in done.notes)
 
 
-def test_depths_that_do_not_fit_16_bits_have_a_larger_unit(labelled_in_motion: Path, tmp_path: Path) -> None:
+def test_unit_of_large_depths(labelled_in_motion: Path, tmp_path: Path) -> None:
     run = Path(shutil.copytree(labelled_in_motion, tmp_path / "run"))
     deep = np.array(Image.open(run / "depth/0001.tiff"))
     deep[0, :2] = 1.0, 2e-5
@@ -99,7 +99,7 @@ def test_depths_that_do_not_fit_16_bits_have_a_larger_unit(labelled_in_motion: P
     assert any("0.1 mm" in note for note in done.notes)
 
 
-def test_cameras_that_the_loaders_cannot_describe(labelled_in_motion: Path, tmp_path: Path, message: Messages) -> None:
+def test_unsupported_cameras(labelled_in_motion: Path, tmp_path: Path, message: Messages) -> None:
     run = Path(shutil.copytree(labelled_in_motion, tmp_path / "run"))
     describe(run, intrinsics=[[45, 0, 22], [0, 46, 16.5], [0, 0, 1]])
     with message.raises(ArgumentError):

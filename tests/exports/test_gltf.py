@@ -1,4 +1,4 @@
-"""The .glb holds the motion and the picture of a run, and Khronos's validator finds nothing wrong with it."""
+"""Motion, picture, tools and cameras in a .glb, which Khronos's validator accepts."""
 
 from __future__ import annotations
 
@@ -30,10 +30,10 @@ from tests.scenes import speckle
 
 Array = NDArray[Any]
 
-# Half the distance of neighbouring numbers of single precision, as a fraction of them.
+# Relative rounding error of float32.
 ROUNDING = 2.0**-24
 
-# Reads a .glb from stdin; its package is found where NODE_PATH says. .ci/run installs it.
+# Reads a .glb from stdin; the package is in NODE_PATH, where .ci/run installs it.
 VALIDATE = """
 const validator = require("gltf-validator");
 validator.validateBytes(new Uint8Array(require("fs").readFileSync(0)))
@@ -42,7 +42,7 @@ validator.validateBytes(new Uint8Array(require("fs").readFileSync(0)))
 
 
 class Glb(NamedTuple):
-    """A .glb, taken apart by its specification."""
+    """Content of a .glb file, decoded by its specification."""
 
     document: dict[str, Any]
     binary: bytes
@@ -71,16 +71,16 @@ class Glb(NamedTuple):
         return self.accessor(self.primitive["attributes"][name])
 
     def at(self, time: float, name: str = "POSITION") -> Array:
-        """The vertices or normals at a time, as a viewer finds them."""
+        """Return the interpolated vertices or normals at a time [s]."""
         (animation,) = self.document["animations"]
         (sampler,), (channel,) = animation["samplers"], animation["channels"]
         assert channel == {"sampler": 0, "target": {"node": 0, "path": "weights"}}
         times, targets = self.accessor(sampler["input"])[:, 0], self.primitive["targets"]
         weights = self.accessor(sampler["output"]).reshape(len(times), len(targets))
-        found = self.attribute(name).astype(float)
+        values = self.attribute(name).astype(float)
         for number, target in enumerate(targets):
-            found += np.interp(time, times, weights[:, number]) * self.accessor(target[name])
-        return found
+            values += np.interp(time, times, weights[:, number]) * self.accessor(target[name])
+        return values
 
 
 def read_glb(path: Path) -> Glb:
@@ -105,51 +105,50 @@ def positions(ran: Path) -> Array:
     return np.asarray(np.load(ran / "trajectory.npz")["position"])
 
 
-def test_every_frame_is_where_the_run_had_it(ran: Path, glb: Path) -> None:
-    found, expected = read_glb(glb), positions(ran)
+def test_positions_and_normals_of_every_frame(ran: Path, glb: Path) -> None:
+    content, expected = read_glb(glb), positions(ran)
     largest = np.abs(expected).max()
     for frame, position in enumerate(expected):
-        # Position and difference are rounded to single precision.
-        np.testing.assert_allclose(found.at(frame / 10), position.reshape(-1, 3), rtol=0, atol=3 * ROUNDING * largest)
-        np.testing.assert_allclose(found.at(frame / 10, "NORMAL"), unit_normals(position), rtol=0, atol=4 * ROUNDING)
+        # Positions and differences are rounded to float32.
+        np.testing.assert_allclose(content.at(frame / 10), position.reshape(-1, 3), rtol=0, atol=3 * ROUNDING * largest)
+        np.testing.assert_allclose(content.at(frame / 10, "NORMAL"), unit_normals(position), rtol=0, atol=4 * ROUNDING)
     between = (expected[2] + expected[3]) / 2
-    # The times are rounded too: by some 1e-8 s, in which a point goes that part of its way in 0.1 s.
+    # So are times, by some 1e-8 s, 1e-7 of the frame interval.
     atol = (3 * ROUNDING + 1e-6) * largest
-    np.testing.assert_allclose(found.at(0.25), between.reshape(-1, 3), rtol=0, atol=atol)
+    np.testing.assert_allclose(content.at(0.25), between.reshape(-1, 3), rtol=0, atol=atol)
 
 
-def test_the_surface_faces_the_viewer_and_has_the_picture_upright(glb: Path) -> None:
-    found = read_glb(glb)
-    corners = found.attribute("POSITION")[found.accessor(found.primitive["indices"]).reshape(-1, 3)]
+def test_orientation_and_texture_coordinates(glb: Path) -> None:
+    content = read_glb(glb)
+    corners = content.attribute("POSITION")[content.accessor(content.primitive["indices"]).reshape(-1, 3)]
     assert len(corners) == 2 * 8 * 10
     area = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     assert (area[:, 2] > 0).all(), "counter-clockwise from above"
-    np.testing.assert_array_equal(found.attribute("NORMAL"), np.tile([0, 0, 1], (99, 1)))
-    # Where neighbours are in one place there is no normal, and a mesh must have one.
+    np.testing.assert_array_equal(content.attribute("NORMAL"), np.tile([0, 0, 1], (99, 1)))
+    # Coincident points have no normal; z replaces it.
     np.testing.assert_array_equal(unit_normals(np.zeros((3, 4, 3), np.float32)), np.tile([0, 0, 1], (12, 1)))
-    # From the upper left, like the picture's rows.
-    places = dict(zip(map(tuple, found.attribute("TEXCOORD_0").tolist()), found.attribute("POSITION"), strict=True))
-    np.testing.assert_allclose(places[0.0, 0.0], [-0.2, 0.15, 0], atol=ROUNDING)
-    np.testing.assert_allclose(places[1.0, 0.0], [0.2, 0.15, 0], atol=ROUNDING)
-    np.testing.assert_allclose(places[0.0, 1.0], [-0.2, -0.15, 0], atol=ROUNDING)
+    # From the upper left.
+    corner = dict(zip(map(tuple, content.attribute("TEXCOORD_0").tolist()), content.attribute("POSITION"), strict=True))
+    for texture, position in (((0, 0), (-0.2, 0.15, 0)), ((1, 0), (0.2, 0.15, 0)), ((0, 1), (-0.2, -0.15, 0))):
+        np.testing.assert_allclose(corner[texture], position, atol=ROUNDING)
 
 
-def test_the_material_shows_the_picture_on_both_sides(glb: Path) -> None:
-    found = read_glb(glb)
-    (material,), (texture,) = found.document["materials"], found.document["textures"]
-    (image,), (sampler,) = found.document["images"], found.document["samplers"]
+def test_material(glb: Path) -> None:
+    content = read_glb(glb)
+    (material,), (texture,) = content.document["materials"], content.document["textures"]
+    (image,), (sampler,) = content.document["images"], content.document["samplers"]
     assert material["doubleSided"]
     assert material["pbrMetallicRoughness"]["baseColorTexture"] == {"index": 0}
-    assert (texture["source"], texture["sampler"], found.primitive["material"]) == (0, 0, 0)
+    assert (texture["source"], texture["sampler"], content.primitive["material"]) == (0, 0, 0)
     assert (image["mimeType"], sampler["wrapS"], sampler["wrapT"]) == ("image/png", 33071, 33071)
-    np.testing.assert_array_equal(found.picture(), speckle(30, 40))
+    np.testing.assert_array_equal(content.picture(), speckle(30, 40))
 
 
-def test_the_part_of_the_picture_that_the_sheet_has(results: Path) -> None:
+def test_region_of_the_picture(results: Path) -> None:
     change_scene(results, region=[5, 7, 20, 10])
     export(results, "gltf", results / "out")
-    found = read_glb(results / "out" / "surface.glb")
-    np.testing.assert_array_equal(found.picture(), speckle(30, 40)[7:17, 5:25])
+    content = read_glb(results / "out" / "surface.glb")
+    np.testing.assert_array_equal(content.picture(), speckle(30, 40)[7:17, 5:25])
 
 
 def without_picture(results: Path) -> Path:
@@ -172,7 +171,7 @@ HELD = {"at": [0.3, 0.6], "force": [0, 0, 1], "load": [[0, 100]], "instrument": 
 
 
 def with_tools_and_cameras(results: Path) -> Path:
-    """A file of a run with two tools, one camera that moves and one that is orthographic."""
+    """Export a run with two tools, a moving and an orthographic camera."""
     moving = {"eye": [[0, 0.1, -0.3, 0.4], [0.4, 0.3, 0.1, 0.5]], "up": [0.2, 1, 0], "fov": 50}
     render = {"camera": None, "cameras": {"left": moving, "above": "top"}}
     change_scene(results, probes=[FINGER, HELD], render=render, output=["trajectory"])
@@ -185,7 +184,7 @@ def furnished(results: Path) -> Glb:
     return read_glb(with_tools_and_cameras(results))
 
 
-def test_a_run_without_a_picture_or_a_motion(results: Path) -> None:
+def test_without_picture_or_motion(results: Path) -> None:
     bare = read_glb(without_picture(results)).document
     assert {"images", "textures", "samplers"}.isdisjoint(bare)
     still = read_glb(with_one_frame(results))
@@ -194,7 +193,7 @@ def test_a_run_without_a_picture_or_a_motion(results: Path) -> None:
 
 
 def validate(data: bytes) -> dict[str, Any]:
-    """Ask Khronos's validator."""
+    """Return the report of Khronos's validator."""
     node = shutil.which("node")
     if node is None:
         pytest.skip("needs node")
@@ -207,17 +206,17 @@ def validate(data: bytes) -> dict[str, Any]:
 
 
 @pytest.mark.parametrize("make", [without_picture, with_one_frame, with_tools_and_cameras, None])
-def test_the_validator_finds_nothing(make: Callable[[Path], Path] | None, glb: Path, results: Path) -> None:
+def test_khronos_validator(make: Callable[[Path], Path] | None, glb: Path, results: Path) -> None:
     report = validate((make(results) if make else glb).read_bytes())
     assert make or (report["info"]["animationCount"], report["info"]["totalTriangleCount"]) == (1, 160)
     issues = report["issues"]
-    # Only that the picture's sides are no powers of two, which WebGL 2 does not mind.
+    # WebGL 2 supports pictures whose sides are not powers of two.
     assert {issue["code"] for issue in issues["messages"]} <= {"IMAGE_NPOT_DIMENSIONS"}
     assert (issues["numErrors"], issues["numWarnings"], issues["numHints"]) == (0, 0, 0)
 
 
 def motion(frames: int) -> Array:
-    """A sheet that goes up slowly, falls within a frame, and then rings."""
+    """Return positions of a sheet that rises slowly, falls within a frame, and rings."""
     time = np.arange(frames) / frames
     height = np.where(time < 0.4, time, 0.1 * np.sin(40 * time) * np.exp(-5 * time))
     shape = np.random.default_rng(0).random((3, 4, 3))
@@ -225,7 +224,7 @@ def motion(frames: int) -> Array:
 
 
 def error_of(position: Array, frames: list[int]) -> float:
-    """The largest distance from straight lines between key frames, point by point."""
+    """Return the largest interpolation error, computed point by point."""
     worst = 0.0
     for index in np.ndindex(position.shape[1:3]):
         path = position[:, index[0], index[1]]
@@ -234,24 +233,23 @@ def error_of(position: Array, frames: list[int]) -> float:
     return worst
 
 
-def test_key_frames_are_where_the_motion_is_sudden() -> None:
+def test_keyframes_of_a_sudden_motion() -> None:
     position = motion(300)
-    found = key_frames(position, 25)
-    assert len(found.frames) == 25
-    assert found.frames == sorted(set(found.frames))
-    assert (found.frames[0], found.frames[-1]) == (0, 299)
-    assert {119, 120} <= set(found.frames), "before and after the fall"
-    # What is said of them is so, but for rounding.
-    assert found.error == pytest.approx(error_of(position, found.frames), rel=1e-12)
+    keys = key_frames(position, 25)
+    assert len(keys.frames) == 25
+    assert keys.frames == sorted(set(keys.frames))
+    assert (keys.frames[0], keys.frames[-1]) == (0, 299)
+    assert {119, 120} <= set(keys.frames), "before and after the fall"
+    assert keys.error == pytest.approx(error_of(position, keys.frames), rel=1e-12)
     evenly = np.linspace(0, 299, 25).round().astype(int).tolist()
-    assert found.error < error_of(position, evenly) / 5
+    assert keys.error < error_of(position, evenly) / 5
 
 
-def test_more_key_frames_than_are_needed_are_not_taken() -> None:
+def test_keyframes_of_simple_motions() -> None:
     straight = np.linspace(0, 1, 50)[:, None, None, None] * np.ones((2, 2, 3))
     assert key_frames(np.zeros((50, 2, 2, 3)), 10) == ([0, 49], 0.0)
     assert key_frames(straight, 10).error <= 2 * ROUNDING**2 * 50
-    assert key_frames(motion(20), 20) == (list(range(20)), 0.0), "all where they are few"
+    assert key_frames(motion(20), 20) == (list(range(20)), 0.0)
 
 
 @pytest.mark.parametrize(
@@ -259,35 +257,34 @@ def test_more_key_frames_than_are_needed_are_not_taken() -> None:
     [("MAX_TARGETS", 2, 2), ("MAX_TARGETS_BYTES", 3 * 99 * 24, 3)],
     ids=["frames", "points"],
 )
-def test_a_run_of_many_frames_or_points_is_told_by_key_frames(
+def test_limits_of_the_morph_targets(
     limit: str, value: int, targets: int, ran: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, message: Messages
 ) -> None:
-    """So that a file stays of a size that browsers load."""
     monkeypatch.setattr(gltf, limit, value)
     done = export(ran, "gltf", tmp_path)
-    found, expected = read_glb(tmp_path / "surface.glb"), positions(ran)
+    content, expected = read_glb(tmp_path / "surface.glb"), positions(ran)
     keys = key_frames(expected, targets + 1)
-    assert len(found.primitive["targets"]) == targets
-    assert f" {keys.error:.2g} m " in done.notes[0]
-    message(done.notes, hide=r"(?<=than )\S+")
-    apart = [found.at(frame / 10) - expected[frame].reshape(-1, 3) for frame in range(5)]
-    assert np.linalg.norm(apart, axis=-1).max() == pytest.approx(keys.error, rel=1e-5)
+    assert len(content.primitive["targets"]) == targets
+    assert f" {keys.error:.2g} m" in done.notes[0]
+    message(done.notes, hide=r"(?<=most )\S+")
+    errors = [content.at(frame / 10) - expected[frame].reshape(-1, 3) for frame in range(5)]
+    assert np.linalg.norm(errors, axis=-1).max() == pytest.approx(keys.error, rel=1e-5)
 
 
-def pose_at(found: Glb, name: str, frame: int) -> tuple[Array, Array]:
-    """Translation and rotation matrix of a node in a frame."""
-    (number,) = [number for number, node in enumerate(found.document["nodes"]) if node["name"] == name]
-    values = {"rotation": np.array([0, 0, 0, 1.0])} | found.document["nodes"][number]
-    (animation,) = found.document["animations"]
+def pose_at(content: Glb, name: str, frame: int) -> tuple[Array, Array]:
+    """Return translation and rotation matrix of a node in a frame."""
+    (number,) = [number for number, node in enumerate(content.document["nodes"]) if node["name"] == name]
+    values = {"rotation": np.array([0, 0, 0, 1.0])} | content.document["nodes"][number]
+    (animation,) = content.document["animations"]
     for channel in animation["channels"]:
         if channel["target"]["node"] == number:
             sampler = animation["samplers"][channel["sampler"]]
-            np.testing.assert_allclose(found.accessor(sampler["input"])[:, 0], np.arange(5) / 10, rtol=1e-6)
-            values[channel["target"]["path"]] = found.accessor(sampler["output"])[frame]
+            np.testing.assert_allclose(content.accessor(sampler["input"])[:, 0], np.arange(5) / 10, rtol=1e-6)
+            values[channel["target"]["path"]] = content.accessor(sampler["output"])[frame]
     return np.array(values["translation"]), Rotation.from_quat(values["rotation"]).as_matrix()
 
 
-def test_tools_are_capsules_where_the_run_had_them(furnished: Glb, results: Path) -> None:
+def test_tools(furnished: Glb, results: Path) -> None:
     run = read_run(results)
     for index, name in enumerate(("probes.0", "probes.1")):
         (mesh,) = [mesh for mesh in furnished.document["meshes"] if mesh["name"] == name]
@@ -309,7 +306,7 @@ def test_tools_are_capsules_where_the_run_had_them(furnished: Glb, results: Path
         assert ends == pytest.approx(capsule.length + 2 * capsule.radius, abs=1e-7)
 
 
-def test_cameras_see_what_those_of_the_run_saw(furnished: Glb, results: Path) -> None:
+def test_cameras(furnished: Glb, results: Path) -> None:
     run, points = read_run(results), np.array([[0.1, 0.05, 0], [-0.15, 0.1, 0.02], [0, -0.1, -0.03]])
     optics = {camera["name"]: camera for camera in furnished.document["cameras"]}
     for name, frame in (("left", 0), ("left", 3), ("above", 3)):
@@ -329,7 +326,7 @@ def test_cameras_see_what_those_of_the_run_saw(furnished: Glb, results: Path) ->
         np.testing.assert_allclose(pixels, view_at(run.scene, frame / 10, name).pixels(points), atol=1e-4)
 
 
-def test_a_distortion_is_left_out_with_a_warning(results: Path, message: Messages) -> None:
+def test_distortion_warning(results: Path, message: Messages) -> None:
     intrinsics = {"fx": 40, "fy": 40, "cx": 19.5, "cy": 14.5}
     camera = {"eye": [0, 0, 0.5], "intrinsics": intrinsics, "distortion": {"k1": 0.01}}
     change_scene(results, render={"camera": camera})

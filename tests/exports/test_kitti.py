@@ -1,8 +1,7 @@
-"""KITTI's pictures hold the flow that a run wrote, as KITTI's own readers see it."""
+"""Flow in KITTI's pictures, decoded as by its development kit."""
 
 from __future__ import annotations
 
-import io
 import shutil
 import struct
 from collections.abc import Callable
@@ -16,9 +15,7 @@ from PIL import Image
 
 from taichi_msm.errors import FilesError
 from taichi_msm.exports.export import export
-from taichi_msm.exports.kitti import encode_flow, png16
-from taichi_msm.runs.arrays import read_flo
-from taichi_msm.runs.finished import reading
+from taichi_msm.exports.kitti import encode_flow
 from tests.golden import Messages
 from tests.outputs import files
 from tests.runs.test_finished import change
@@ -28,7 +25,7 @@ BACKGROUND = 1e10
 
 
 def made_up_flow(seed: int) -> NDArray[np.float32]:
-    """Flow of all sizes, with a background."""
+    """Return flow of all magnitudes, with a background."""
     rng = np.random.default_rng(seed)
     flow = rng.normal(0, 1, (HEIGHT, WIDTH, 2)) * 10 ** rng.uniform(-3, 2.6, (HEIGHT, WIDTH, 1))
     flow[rng.random((HEIGHT, WIDTH)) < 0.2] = BACKGROUND
@@ -36,14 +33,14 @@ def made_up_flow(seed: int) -> NDArray[np.float32]:
 
 
 def write_flo(path: Path, flow: NDArray[np.float32]) -> None:
-    """As Middlebury describes it, and apart from what reads it here."""
+    """Write a .flo file by Middlebury's description."""
     height, width, _ = flow.shape
     path.write_bytes(np.float32(202021.25).tobytes() + struct.pack("<ii", width, height) + flow.astype("<f4").tobytes())
 
 
 @pytest.fixture
 def labelled(results: Path) -> Path:
-    """Results of which some flow is hidden."""
+    """Results with flow and occlusion."""
     for name in ("flow", "occlusion"):
         (results / name).mkdir()
     for pair in range(PAIRS):
@@ -57,18 +54,18 @@ def hidden(pair: int) -> NDArray[np.bool_]:
 
 
 def read_png(path: Path) -> NDArray[np.uint16]:
-    """Read a PNG by a library of its own."""
+    """Read a PNG with pypng."""
     width, height, rows, about = png.Reader(bytes=path.read_bytes()).read()
     assert (about["bitdepth"], about["planes"]) == (16, 3)
     return np.array([list(row) for row in rows], np.uint16).reshape(height, width, 3)
 
 
 def decode(colours: NDArray[np.uint16]) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
-    """As flow_read of KITTI's development kit does."""
+    """Return flow and validity, as flow_read of KITTI's development kit."""
     return (colours[..., :2].astype(float) - 2**15) / 64, colours[..., 2] > 0
 
 
-def test_flow_comes_back(labelled: Path) -> None:
+def test_flow_round_trip(labelled: Path) -> None:
     done = export(labelled, "kitti", labelled / "out")
     training = labelled / "out" / "training"
     assert done.notes == []
@@ -76,24 +73,18 @@ def test_flow_comes_back(labelled: Path) -> None:
         flow, name = made_up_flow(pair).astype(float), f"{pair:06}_10.png"
         fits = ((flow >= -512) & (flow <= 511.98)).all(axis=-1)
         assert 0.5 < fits.mean() < 0.8
-        found, valid = decode(read_png(training / "flow_occ" / name))
+        decoded, valid = decode(read_png(training / "flow_occ" / name))
         np.testing.assert_array_equal(valid, fits)
         # To the nearest 1/64 px.
-        np.testing.assert_allclose(found[valid], flow[valid], rtol=0, atol=1 / 128)
-        seen, also_seen = decode(read_png(training / "flow_noc" / name))
-        np.testing.assert_array_equal(also_seen, fits & ~hidden(pair))
-        np.testing.assert_array_equal(seen[also_seen], found[also_seen])
-
-
-def test_every_pair_has_its_two_pictures(labelled: Path) -> None:
-    export(labelled, "kitti", labelled / "out")
-    written = files(labelled / "out" / "training")
+        np.testing.assert_allclose(decoded[valid], flow[valid], rtol=0, atol=1 / 128)
+        visible, valid = decode(read_png(training / "flow_noc" / name))
+        np.testing.assert_array_equal(valid, fits & ~hidden(pair))
+        np.testing.assert_array_equal(visible[valid], decoded[valid])
+    written, frames = files(training), files(labelled / "frames")
     kinds = ["flow_noc/{}_10.png", "flow_occ/{}_10.png", "image_2/{}_10.png", "image_2/{}_11.png"]
     assert sorted(written) == sorted(kind.format(f"{pair:06}") for pair in range(PAIRS) for kind in kinds)
-    frames = files(labelled / "frames")
-    for pair in range(PAIRS):
-        for number in (0, 1):
-            assert written[f"image_2/{pair:06}_1{number}.png"] == frames[f"{pair + number:04}.png"]
+    for pair, number in np.ndindex(PAIRS, 2):
+        assert written[f"image_2/{pair:06}_1{number}.png"] == frames[f"{pair + number:04}.png"]
 
 
 @pytest.mark.parametrize(
@@ -101,33 +92,21 @@ def test_every_pair_has_its_two_pictures(labelled: Path) -> None:
     [
         ((0, 0), (32768, 32768, 1)),
         ((1, -2.5), (32832, 32608, 1)),
-        ((-512, 511.984375), (0, 65535, 1)),
-        # To the nearest, also at both ends.
+        # Rounded to the nearest, also at both ends.
         ((0.0156, 0.0079), (32769, 32769, 1)),
         ((-512.007, 511.99), (0, 65535, 1)),
         ((-512.008, 0), (0, 0, 0)),
         ((0, 511.993), (0, 0, 0)),
         ((BACKGROUND, BACKGROUND), (0, 0, 0)),
         ((np.nan, 0), (0, 0, 0)),
-        ((0, -np.inf), (0, 0, 0)),
     ],
 )
-def test_what_a_flow_is_in_colours(flow: tuple[float, float], colours: tuple[int, ...]) -> None:
+def test_encoded_flow(flow: tuple[float, float], colours: tuple[int, ...]) -> None:
     assert encode_flow(np.array([[flow]], np.float32)).ravel().tolist() == list(colours)
     assert encode_flow(np.array([[flow]], np.float32), np.array([[False]])).ravel().tolist() == [0, 0, 0]
 
 
-@pytest.mark.parametrize("shape", [(1, 1), (37, 53)])
-def test_a_picture_of_16_bits_comes_back(shape: tuple[int, int], tmp_path: Path) -> None:
-    colours = np.random.default_rng(0).integers(0, 1 << 16, (*shape, 3)).astype(np.uint16)
-    data = png16(colours)
-    (tmp_path / "picture.png").write_bytes(data)
-    np.testing.assert_array_equal(read_png(tmp_path / "picture.png"), colours)
-    # Pillow keeps the higher byte, and checks every checksum.
-    np.testing.assert_array_equal(np.asarray(Image.open(io.BytesIO(data))), colours >> 8)
-
-
-def test_what_is_not_there_is_left_out_and_said(labelled: Path, message: Messages) -> None:
+def test_missing_outputs_are_reported(labelled: Path, message: Messages) -> None:
     shutil.rmtree(labelled / "occlusion")
     shutil.rmtree(labelled / "frames")
     done = export(labelled, "kitti", labelled / "out")
@@ -135,49 +114,30 @@ def test_what_is_not_there_is_left_out_and_said(labelled: Path, message: Message
     message(done.notes, "flow_noc", "image_2")
 
 
-def test_one_frame_has_no_flow(labelled: Path, message: Messages) -> None:
+def test_single_frame(labelled: Path, message: Messages) -> None:
     change(labelled, frames=1)
     with message.raises(FilesError, "frame"):
         export(labelled, "kitti", labelled / "out")
 
 
-WHOLE = b"PIEH" + struct.pack("<ii", WIDTH, HEIGHT) + bytes(8 * WIDTH * HEIGHT)
-
-
-@pytest.mark.parametrize(
-    "data",
-    [
-        b"PIEH",
-        WHOLE + b"\0",
-        WHOLE.replace(b"PIEH", b"HEIP"),
-        b"PIEH" + struct.pack("<ii", HEIGHT, WIDTH) + WHOLE[12:],
-        b"PIEH" + struct.pack("<ii", 1 << 30, 1 << 30) + WHOLE[12:],
-    ],
-    ids=["cut in its header", "longer", "another kind", "turned", "huge"],
-)
-def test_damaged_flow_is_one_line(data: bytes, tmp_path: Path, message: Messages) -> None:
-    path = tmp_path / "0000.flo"
-    path.write_bytes(WHOLE)
-    assert read_flo(path, (WIDTH, HEIGHT)).shape == (HEIGHT, WIDTH, 2)
-    path.write_bytes(data)
-    with message.raises(FilesError, "0000.flo"), reading(path):
-        read_flo(path, (WIDTH, HEIGHT))
-
-
+FLO = b"PIEH" + struct.pack("<ii", WIDTH, HEIGHT) + bytes(8 * WIDTH * HEIGHT)
 DAMAGE: dict[str, tuple[str, Callable[[Path], object]]] = {
-    "no flow": ("flow/0002.flo", Path.unlink),
-    "a small frame": ("frames/0000.png", lambda path: Image.new("RGB", (8, 6)).save(path)),
-    "no picture": ("occlusion/0000.png", lambda path: path.write_bytes(b"?")),
-    "a cut picture": ("frames/0001.png", lambda path: path.write_bytes(path.read_bytes()[:200])),
+    "truncated flow": ("flow/0001.flo", lambda path: path.write_bytes(b"PIEH")),
+    "longer flow": ("flow/0001.flo", lambda path: path.write_bytes(FLO + b"\0")),
+    "magic number": ("flow/0001.flo", lambda path: path.write_bytes(b"HEIP" + FLO[4:])),
+    "rotated flow": ("flow/0001.flo", lambda path: path.write_bytes(FLO[:4] + FLO[8:12] + FLO[4:8] + FLO[12:])),
+    "huge flow": ("flow/0001.flo", lambda path: path.write_bytes(FLO[:4] + struct.pack("<ii", 1 << 30, 1 << 30))),
+    "missing flow": ("flow/0002.flo", Path.unlink),
+    "small frame": ("frames/0000.png", lambda path: Image.new("RGB", (8, 6)).save(path)),
+    "not a picture": ("occlusion/0000.png", lambda path: path.write_bytes(b"?")),
+    "truncated picture": ("frames/0001.png", lambda path: path.write_bytes(path.read_bytes()[:200])),
 }
 
 
 @pytest.mark.parametrize(("name", "change"), DAMAGE.values(), ids=DAMAGE)
-def test_a_damaged_file_is_named_and_nothing_is_written(
-    name: str, change: Callable[[Path], object], labelled: Path, message: Messages
-) -> None:
+def test_damaged_results(name: str, change: Callable[[Path], object], labelled: Path, message: Messages) -> None:
     change(labelled / name)
-    # Why it cannot be decoded are words of Pillow.
+    # The reason is in Pillow's words.
     with message.raises(FilesError, name, hide=r"(?<=decoded )\(.*\)"):
         export(labelled, "kitti", labelled / "out")
     assert not (labelled / "out").exists()

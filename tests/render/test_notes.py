@@ -124,7 +124,7 @@ def test_check_and_run_print_warnings(small: Path, program: Program) -> None:
         {"eye": [[0, 0, 0.1, 0.3], [1, 0.1, 0, 0.4]], "target": [3, 0, 0.4]},
         {
             "eye": [0, 0, 0.4],
-            "intrinsics": {"fx": 15, "fy": 15, "cx": 2000, "cy": 256},
+            "intrinsics": {"fx": 26, "fy": 26, "cx": 2000, "cy": 256},
             "distortion": {"model": "fisheye"},
             "outside": "background",
         },

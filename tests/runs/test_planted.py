@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from taichi_msm.cli.session import result_directory
+from taichi_msm.cli.common import result_directory
 from taichi_msm.errors import FilesError
 from taichi_msm.render.labels import FrameOutputs
 from taichi_msm.runs.checkpoint import STATE_FILE, is_unfinished, read_manifest

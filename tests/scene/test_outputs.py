@@ -1,11 +1,9 @@
-"""The table of outputs fits what it speaks of."""
+"""Table of outputs: sources, formats, and names of files."""
 
 from __future__ import annotations
 
 import re
 from pathlib import Path
-
-import pytest
 
 from taichi_msm.render.labels import Flow, FrameOutputs, Labels, Stereo
 from taichi_msm.runs.writer import _LABEL_WRITERS
@@ -14,7 +12,7 @@ from taichi_msm.scene.outputs import OUTPUTS, RESULT_PATTERNS, file_names, resul
 FIELDS = {"labels": Labels._fields, "flow": Flow._fields, "stereo": Stereo._fields}
 
 
-def test_every_label_has_its_field_and_a_format() -> None:
+def test_fields_and_formats_of_the_labels() -> None:
     for output in OUTPUTS.values():
         assert output.source in (*FrameOutputs._fields, "positions", "forces")
         if output.source in FIELDS:
@@ -24,7 +22,7 @@ def test_every_label_has_its_field_and_a_format() -> None:
             assert output.pixel_bytes > 0
 
 
-def test_the_files_of_a_run_in_the_order_of_its_record() -> None:
+def test_file_names_of_a_run() -> None:
     assert result_names({"": ["tracks", "flow", "gif", "png"]}) == [
         *("frames", "flow", "animation.gif", "tracks.npz", "camera.json", "run.json")
     ]
@@ -40,21 +38,11 @@ def test_the_files_of_a_run_in_the_order_of_its_record() -> None:
     assert file_names(["frames"], 10001)[-1] == "frames/10000.png"
 
 
-@pytest.mark.parametrize(
-    "name",
-    [
-        "frames/00001.png",
-        "frames/12.png",
-        "frames/0000.npy",
-        "frames",
-        "run_json",
-        "a/run.json",
-        "a/b/camera.json",
-        "a/trajectory.npz",
-    ],
-)
-def test_no_other_file_is_taken_for_one_of_a_run(name: str) -> None:
-    seen = [output.name for output in OUTPUTS.values() if output.is_camera_output]
-    every = file_names(result_names({"": OUTPUTS, "left": seen}), 3)
-    assert all(re.fullmatch("|".join(RESULT_PATTERNS), file) for file in every)
-    assert not re.fullmatch("|".join(RESULT_PATTERNS), name)
+def test_patterns_match_only_results() -> None:
+    camera_outputs = [output.name for output in OUTPUTS.values() if output.is_camera_output]
+    names = file_names(result_names({"": OUTPUTS, "left": camera_outputs}), 3)
+    pattern = re.compile("|".join(RESULT_PATTERNS))
+    assert all(map(pattern.fullmatch, names))
+    foreign = ["frames/00001.png", "frames/12.png", "frames/0000.npy", "frames", "run_json"]
+    foreign += ["a/run.json", "a/b/camera.json", "a/trajectory.npz"]
+    assert not any(map(pattern.fullmatch, foreign))

@@ -1,4 +1,4 @@
-"""The sweep files in scenes/sweeps/, and the pictures that they choose from."""
+"""The shipped sweep files, and their pictures."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from taichi_msm.load.scene_file import plan_file
 from taichi_msm.sweeps.spec import load_sweep
 
 
-def test_no_run_of_the_data_set_is_refused(root: Path) -> None:
+def test_runs_of_the_data_set_are_valid(root: Path) -> None:
     sweep = load_sweep(root / "scenes/sweeps/tracking.yaml")
     plans = [plan_file(sweep.scene, sweep.overrides(values)) for values in sweep.values()]
     assert len(plans) == 64
@@ -23,13 +23,12 @@ def test_no_run_of_the_data_set_is_refused(root: Path) -> None:
     }
 
 
-# All are painted by one function.
 @pytest.mark.parametrize(
     "name", [pytest.param(name, marks=() if "pale" in name else pytest.mark.slow) for name in PICTURES]
 )
-def test_shipped_pictures_are_painted_by_their_script(name: str) -> None:
+def test_shipped_pictures_are_those_of_their_script(name: str) -> None:
     painted, shipped = (
         np.asarray(image.convert("RGB"), dtype=float) for image in (paint(PICTURES[name]), Image.open(FOLDER / name))
     )
-    # Rounding elsewhere may move a colour by one, and with it the choice of 256 colours.
+    # Rounding on other machines may change a colour by one, and with it the choice of 256 colours.
     assert np.abs(painted - shipped).mean() < 1

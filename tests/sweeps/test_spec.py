@@ -1,4 +1,4 @@
-"""Sweep files: what they mean, and every fault of one."""
+"""Sweep files: values of the runs, and faults."""
 
 from __future__ import annotations
 
@@ -23,9 +23,10 @@ from taichi_msm.sweeps.expressions import evaluate
 from taichi_msm.sweeps.spec import Distribution, Sweep, SweepSettings, format_override, load_sweep, make_sweep
 from tests.golden import Messages
 from tests.scenes import speckle
+from tests.sweeps.conftest import CALIBRATION, POSES
 
 
-def shares(dimensions: int, samples: int, seed: int) -> Any:
+def sobol_points(dimensions: int, samples: int, seed: int) -> Any:
     """Points of SciPy's scrambled Sobol sequence, without its warning about other numbers than powers of two."""
     return qmc.Sobol(dimensions, scramble=True, seed=np.random.default_rng(seed)).random(
         2 ** math.ceil(math.log2(samples))
@@ -33,15 +34,15 @@ def shares(dimensions: int, samples: int, seed: int) -> Any:
 
 
 def values(samples: int | None, **vary: dict[str, Any]) -> list[list[Any]]:
-    return made(samples, **vary).values()
+    return sweep_of(samples, **vary).values()
 
 
-def made(samples: int | None, **vary: dict[str, Any]) -> Sweep:
+def sweep_of(samples: int | None, **vary: dict[str, Any]) -> Sweep:
     scene: Any = None
     return Sweep(scene, SweepSettings(scene="any.yaml", samples=samples, seed=3, vary=vary))
 
 
-def test_every_number_and_every_choice_takes_a_dimension_in_the_order_of_the_keys() -> None:
+def test_dimensions_in_the_order_of_the_keys() -> None:
     rows = values(
         5,
         a={"uniform": [2, 3]},
@@ -50,37 +51,34 @@ def test_every_number_and_every_choice_takes_a_dimension_in_the_order_of_the_key
         d={"normal": [1, 0.5]},
     )
     assert len(rows) == 5
-    for row, u in zip(rows, shares(5, 5, 3)[:5], strict=True):
-        # Rounding: a few operations on numbers near these.
+    for row, u in zip(rows, sobol_points(5, 5, 3)[:5], strict=True):
+        # Rounding of a few operations.
         assert row[0] == pytest.approx(2 + u[0], rel=1e-15)
         assert row[1] == pytest.approx([100 ** u[1], 10.0], rel=1e-14)
         assert row[2] == "xyz"[int(3 * u[3])]
         assert row[3] == pytest.approx(1 + 0.5 * ndtri(u[4]), rel=1e-14)
 
 
-def test_more_samples_begin_with_the_same_ones() -> None:
+def test_more_samples_extend_the_sequence() -> None:
     vary = {"a": {"uniform": [0, 1]}, "b": {"normal": [0, 1]}}
     assert values(1000, **vary)[:3] == values(3, **vary)
     assert values(1, **vary) == values(3, **vary)[:1]
     assert math.isfinite(Distribution(normal=[0, 1]).value([0.0]))
 
 
-def test_a_lists_numbers_keep_their_shape() -> None:
+def test_lists_keep_their_shape() -> None:
     (((first, (time, force)),),) = values(1, load={"uniform": [[[0, 0], [0.2, 100]], [[0, 0], [0.4, 100]]]})
     assert (first, force) == ([0, 0], 100)
     assert 0.2 <= time <= 0.4
 
 
-def test_some_runs_are_spread_over_all() -> None:
-    ten = {"grid": list(range(10))}
-    grids = made(None, a=ten, b={"grid": list(range(1000))})
-    assert grids.values()[1234] == [1, 234]
-    assert grids.values(4) == [[1, 250], [3, 750], [6, 250], [8, 750]]
-    assert made(None, a=ten).values(100) == [[n] for n in range(10)]
-
-
-def test_grids_give_every_combination_the_last_key_fastest() -> None:
+def test_grids_give_every_combination() -> None:
     assert values(None, a={"grid": [1, 2]}, b={"grid": ["x", [3, 4]]}) == [[1, "x"], [1, [3, 4]], [2, "x"], [2, [3, 4]]]
+    ten = {"grid": list(range(10))}
+    grids = sweep_of(None, a=ten, b={"grid": list(range(1000))})
+    assert grids.values()[1234] == [1, 234]
+    assert grids.values(4) == [[1, 250], [3, 750], [6, 250], [8, 750]], "evenly spaced runs"
+    assert sweep_of(None, a=ten).values(100) == [[n] for n in range(10)]
 
 
 CELLS: list[Any] = [
@@ -90,7 +88,7 @@ CELLS: list[Any] = [
 
 
 @pytest.mark.parametrize("value", CELLS)
-def test_a_cell_is_what_set_takes(value: Any) -> None:
+def test_cells_are_arguments_of_set(value: Any) -> None:
     assert parse_override(f"key={format_override(value)}").value == value
 
 
@@ -100,45 +98,41 @@ def folder(small: Path) -> Path:
     (small / "textures").mkdir()
     for name in ("b", "a"):
         Image.fromarray(speckle(30, 40, ord(name))).save(small / "textures" / f"{name}.png")
-    (small / "textures" / "notes.txt").write_text("no picture")
+    (small / "textures" / "notes.txt").write_text("not a picture")
     return small
 
 
-CALIBRATION = "K: [50, 0, 20, 0, 50, 15, 0, 0, 1]\nD: [0, 0, 0, 0]\nwidth: 40\nheight: 30\n"
-POSES = "0 0 0 0.4 1 0 0 0\n9 0 0 0.5 1 0 0 0\n"
-
-
-def test_files_are_found_from_the_sweep_file_and_given_from_the_scene(folder: Path) -> None:
+def test_paths_of_files(folder: Path) -> None:
     for below in ("scenes", "lab"):
         (folder / below).mkdir()
     for name in ("small.yaml", "speckle.png"):
         (folder / name).rename(folder / "scenes" / name)
-    for name, text in (("a.yml", CALIBRATION), ("b.yml", CALIBRATION), ("way.txt", POSES)):
+    for name, text in (("a.yml", CALIBRATION), ("b.yml", CALIBRATION), ("t.txt", POSES)):
         (folder / "lab" / name).write_text(text)
     (folder / "many.yaml").write_text(
         "scene: scenes/small.yaml\nsamples: 4\nvary:\n"
         '  image: {choice: "textures/*.png"}\n'
         '  render.cameras.left.calibration: {choice: "lab/*.yml"}\n'
-        "  render.cameras.7: {choice: [{poses: lab/way.txt}]}\n"
+        "  render.cameras.7: {choice: [{poses: lab/t.txt}]}\n"
         "set:\n  springs.map: {image: textures/a.png, range: [1, 2]}\n"
-        "  render.cameras: {left: {calibration: lab/a.yml, poses: lab/way.txt}}\n"
+        "  render.cameras: {left: {calibration: lab/a.yml, poses: lab/t.txt}}\n"
     )
     sweep = load_sweep("many.yaml")
     assert [distribution.values for distribution in sweep.settings.vary.values()] == [
         ["../textures/a.png", "../textures/b.png"],
         ["../lab/a.yml", "../lab/b.yml"],
-        [{"poses": "../lab/way.txt"}],
+        [{"poses": "../lab/t.txt"}],
     ]
-    overrides = sweep.overrides(["../textures/b.png", "../lab/b.yml", {"poses": "../lab/way.txt"}])
+    overrides = sweep.overrides(["../textures/b.png", "../lab/b.yml", {"poses": "../lab/t.txt"}])
     assert overrides == (
         'springs.map={"image": "../textures/a.png", "range": [1, 2]}',
-        'render.cameras={"left": {"calibration": "../lab/a.yml", "poses": "../lab/way.txt"}}',
+        'render.cameras={"left": {"calibration": "../lab/a.yml", "poses": "../lab/t.txt"}}',
         "image=../textures/b.png",
         "render.cameras.left.calibration=../lab/b.yml",
-        'render.cameras.7={"poses": "../lab/way.txt"}',
+        'render.cameras.7={"poses": "../lab/t.txt"}',
     )
     assert {os.path.relpath(path) for path in sweep.files} == {
-        *("textures/a.png", "textures/b.png", "lab/a.yml", "lab/b.yml", "lab/way.txt", "scenes/speckle.png"),
+        *("textures/a.png", "textures/b.png", "lab/a.yml", "lab/b.yml", "lab/t.txt", "scenes/speckle.png"),
     }
     plan = load_plan("scenes/small.yaml", overrides)
     assert plan.scene.pictures == {
@@ -153,13 +147,13 @@ def test_files_are_found_from_the_sweep_file_and_given_from_the_scene(folder: Pa
     }
 
 
-def test_every_key_of_a_scene_that_names_a_file_is_known() -> None:
+def test_keys_that_name_files() -> None:
     schema = Scene.model_json_schema()
-    found = set()
+    keys = set()
 
     def walk(part: dict[str, Any], key: tuple[str, ...]) -> None:
         if part.get("maxLength") == MAX_PATH:
-            found.add(key)
+            keys.add(key)
         for name, inner in part.get("properties", {}).items():
             walk(inner, (*key, name))
         for inner in (part.get("additionalProperties"), part.get("items")):
@@ -171,17 +165,17 @@ def test_every_key_of_a_scene_that_names_a_file_is_known() -> None:
             walk(schema["$defs"][part["$ref"].rpartition("/")[2]], key)
 
     walk(schema, ())
-    assert len(found) == 8
-    assert all(map(names_file, found))
+    assert len(keys) == 8
+    assert all(map(names_file, keys))
 
 
-def test_variables_take_the_first_dimensions_and_columns(folder: Path) -> None:
+def test_variables_and_their_columns(folder: Path) -> None:
     varied = {"damping": {"uniform": [0.01, 0.02]}}
     expressions = {"probes.0.at": ["=x", "=1 - x"], "time.duration": "=n / 10", "sheet.points": ["=2*n**2 + 1", 9]}
     variables = {"x": {"uniform": [0, 1]}, "n": {"choice": [2, 3]}}
     swept = make_sweep("small.yaml", {"samples": 4, "variables": variables, "vary": varied, "set": expressions})
     assert swept.keys == ["x", "n", "damping"]
-    for row, u in zip(swept.values(), shares(3, 4, 1), strict=True):
+    for row, u in zip(swept.values(), sobol_points(3, 4, 1), strict=True):
         assert row == pytest.approx([u[0], 2 + int(2 * u[1]), 0.01 + 0.01 * u[2]], rel=1e-15)
         x, n, damping = row
         assert swept.overrides(row) == (
@@ -197,7 +191,7 @@ def test_variables_take_the_first_dimensions_and_columns(folder: Path) -> None:
     assert "variables" not in make_sweep("small.yaml", {"samples": 4, "vary": varied}).description()
 
 
-def test_an_expression_without_a_value_is_the_refusal_of_its_run(folder: Path, message: Messages) -> None:
+def test_expression_without_a_value_refuses_its_run(folder: Path, message: Messages) -> None:
     settings = {"variables": {"x": {"grid": [0, 1]}}, "set": {"probes.0.at": [0.5, "=sqrt(x - 1)"]}}
     swept = make_sweep("small.yaml", settings)
     refused, valid = (swept.overrides(row) for row in swept.values())
@@ -216,16 +210,16 @@ EXPRESSIONS = {
 
 
 @pytest.mark.parametrize("text", EXPRESSIONS)
-def test_an_expression_is_arithmetic(text: str) -> None:
-    found = evaluate(text, {"x": 0.5})
-    assert (found, type(found)) == (EXPRESSIONS[text], type(EXPRESSIONS[text]))
+def test_expressions(text: str) -> None:
+    value = evaluate(text, {"x": 0.5})
+    assert (value, type(value)) == (EXPRESSIONS[text], type(EXPRESSIONS[text]))
 
 
 GOOD = {"scene": "small.yaml", "samples": 2, "vary": {"damping": {"uniform": [0.01, 0.02]}}}
 
 
-def vary(way: Any, key: str = "damping") -> dict[str, Any]:
-    return {"vary": {key: way}}
+def vary(distribution: Any, key: str = "damping") -> dict[str, Any]:
+    return {"vary": {key: distribution}}
 
 
 def expression(text: str, **variables: Any) -> dict[str, Any]:
@@ -239,20 +233,19 @@ FAULTS: dict[str, tuple[dict[str, Any], str]] = {
     "samples missing": ({"samples": None}, "samples"),
     "nothing varies": ({"vary": {}}, "vary"),
     "samples of a grid": (vary({"grid": [1]}), "samples"),
-    "upside down": (vary({"uniform": [3, 2]}), "vary.damping.uniform"),
+    "high below low": (vary({"uniform": [3, 2]}), "vary.damping.uniform"),
     "logarithm": (vary({"log_uniform": [0, 2]}), "vary.damping.log_uniform"),
     "deviation": (vary({"normal": [0, -2]}), "vary.damping.normal"),
     "shapes": (vary({"uniform": [[1, 2], [3]]}), "vary.damping.uniform"),
     "no choice": (vary({"choice": []}), "vary.damping.choice"),
-    "unknown way": (vary({"unifrom": [1, 2]}), "vary.damping.unifrom"),
-    "two ways": (vary({"uniform": [1, 2], "choice": [1]}), "vary.damping"),
-    "no way": (vary([0.01, 0.02]), "vary.damping"),
+    "unknown distribution": (vary({"unifrom": [1, 2]}), "vary.damping.unifrom"),
+    "two distributions": (vary({"uniform": [1, 2], "choice": [1]}), "vary.damping"),
+    "no distribution": (vary([0.01, 0.02]), "vary.damping"),
     "not finite": (vary({"choice": [math.nan]}), "vary.damping.choice"),
     "too large": (vary({"uniform": [0, 1e31]}), "vary.damping.uniform"),
     "dimensions": (vary({"uniform": [[0] * 21202, [1] * 21202]}), "vary"),
     "unknown key varies": (vary({"uniform": [1, 2]}, "dampign"), "vary.dampign"),
     "a section varies": (vary({"shear": {"uniform": [1, 2]}}, "springs"), "vary.springs"),
-    "long name": (vary({"choice": ["a" * 300]}, "image"), "vary.image.choice.0"),
     "no picture": (vary({"choice": ["textures/c.png"]}, "image"), "vary.image.choice.0"),
     "no match": (vary({"choice": "textures/*.jpg"}, "image"), "vary.image.choice"),
     "picture outside": (vary({"choice": ["/etc/hostname"]}, "image"), "vary.image.choice.0"),
@@ -261,23 +254,17 @@ FAULTS: dict[str, tuple[dict[str, Any], str]] = {
         "vary.render.cameras.left.poses.choice.0",
     ),
     "unknown key set": ({"set": {"sheet.pionts": [3, 3]}}, "set.sheet.pionts"),
-    "no fourth probe": ({"set": {"probes.3.falloff": 5}}, "set.probes.3.falloff"),
     "replaced": ({"set": {"damping": 1}}, "vary"),
     "section replaced": ({"set": {"springs.shear": 3}, **vary({"choice": [{"shear": 1}]}, "springs")}, "vary"),
     "a variable of texts": ({"variables": {"x": {"choice": ["a"]}}}, "variables.x.choice"),
-    "a variable of two": ({"variables": {"x": {"uniform": [[0, 0], [1, 1]]}}}, "variables.x.uniform"),
     "a column": ({"variables": {"seconds": {"uniform": [0, 1]}}}, "variables.seconds"),
     "a varied key": ({"variables": {"damping": {"uniform": [0, 1]}}}, "variables.damping"),
     "a function": ({"variables": {"max": {"uniform": [0, 1]}}}, "variables.max"),
     "unknown variable": (expression("=radius + 1", radios={"uniform": [0, 1]}), "set.probes.0.force.1"),
     "too large a power": (expression("=x * 9**9**9", x={"uniform": [0, 1]}), "set.probes.0.force.1"),
     "not allowed": (expression("=__import__('os').getpid()"), "set.probes.0.force.1"),
-    "arguments": (expression("=sqrt(1, 2)"), "set.probes.0.force.1"),
     "no expression": (expression("=2 x"), "set.probes.0.force.1"),
     "a long expression": (expression("=" + "-" * 200), "set.probes.0.force.1"),
-    "equals sign": ({"set": {"damping=1": 1}}, "set.damping=1"),
-    "unknown section set": ({"set": {"sprigns.shear": 1}}, "set.sprigns.shear"),
-    "calibration outside": ({"set": {"render.camera": {"calibration": "/etc/hostname"}}}, "set.render.camera"),
     "no calibration": ({"set": {"render.camera.calibration": "a.yml"}}, "set.render.camera.calibration"),
     "combinations": (
         {"samples": None, "vary": {key: {"grid": list(range(4000))} for key in ("damping", "springs.shear")}},
@@ -287,17 +274,16 @@ FAULTS: dict[str, tuple[dict[str, Any], str]] = {
 
 
 @pytest.mark.parametrize("name", FAULTS)
-def test_a_fault_of_a_sweep_file_is_told_at_its_key(folder: Path, name: str, message: Messages) -> None:
+def test_fault_names_its_key(folder: Path, name: str, message: Messages) -> None:
     change, key = FAULTS[name]
     data = {key: value for key, value in {**GOOD, **change}.items() if value is not None}
-    # JSON is YAML.
     (folder / "many.yaml").write_text(json.dumps(data).replace("NaN", ".nan"))
     with message.raises(SceneError, "many.yaml:1:", f": {key}: ") as raised:
         load_sweep("many.yaml")
     assert "\n" not in str(raised.value)
 
 
-def test_all_faults_are_told_at_once_in_their_order(folder: Path) -> None:
+def test_all_faults_are_reported_in_order(folder: Path) -> None:
     (folder / "many.yaml").write_text(
         "scene: small.yaml\nseed: -1\nvary:\n  damping: {uniform: [2, 1]}\n"
         "  image: {choice: [c.png, speckle.png, d.png]}\n  spring.shear: {grid: [1]}\n"
@@ -309,36 +295,12 @@ def test_all_faults_are_told_at_once_in_their_order(folder: Path) -> None:
     ]
 
 
-def test_a_scene_and_a_sweep_are_told_apart(folder: Path, message: Messages) -> None:
+def test_files_of_the_wrong_kind(folder: Path, message: Messages) -> None:
     with message.raises(SceneError, "small.yaml:1:1", "taichi-msm run"):
         load_sweep("small.yaml")
     (folder / "many.yaml").write_text(json.dumps(GOOD))
     with message.raises(SceneError, "many.yaml:1:1", "taichi-msm sweep"):
         load_plan("many.yaml")
-
-
-def test_a_fault_of_the_scene_is_told_before_anything_runs(folder: Path, message: Messages) -> None:
     (folder / "small.yaml").write_text((folder / "small.yaml").read_text() + "dampign: 1\n")
-    (folder / "many.yaml").write_text(json.dumps(GOOD))
     with message.raises(SceneError, "many.yaml:1:", "dampign"):
         load_sweep("many.yaml")
-
-
-def test_folders_may_be_links(folder: Path) -> None:
-    (folder / "real" / "scenes").mkdir(parents=True)
-    (folder / "pictures").mkdir()
-    (folder / "textures" / "a.png").rename(folder / "pictures" / "a.png")
-    for name in ("small.yaml", "speckle.png"):
-        (folder / name).rename(folder / "real" / "scenes" / name)
-    (folder / "link").symlink_to(folder / "real" / "scenes")
-    (folder / "many.yaml").write_text(
-        json.dumps({**GOOD, "scene": "link/small.yaml", "set": {"image": "pictures/a.png"}})
-    )
-    sweep = load_sweep("many.yaml")
-    (override, _) = sweep.overrides([0.01])
-    # Beside the link there is no such folder.
-    assert (sweep.scene.folder / override.removeprefix("image=")).samefile("pictures/a.png")
-    (folder / "far").mkdir()
-    (folder / "far" / "sweeps").symlink_to(folder / "real" / "scenes")
-    (folder / "real" / "scenes" / "here.yaml").write_text(json.dumps({**GOOD, "scene": "../scenes/small.yaml"}))
-    assert load_sweep("far/sweeps/here.yaml").keys == ["damping"]

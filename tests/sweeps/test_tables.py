@@ -1,4 +1,4 @@
-"""The files that a sweep ends with say what came out of it, and are there whatever came out."""
+"""Reports of a sweep: their content, and failures."""
 
 from __future__ import annotations
 
@@ -47,13 +47,13 @@ Make = Callable[..., SweepState]
 
 @pytest.fixture
 def make(small: Path, ran: Path) -> Make:
-    """A sweep of small.yaml with records of runs, and made-up outcomes.
+    """Return a function that builds a sweep of small.yaml with records of runs and synthetic outcomes.
 
-    The displacement follows from the damping; run 3 and every seventh after it diverged.
+    The displacement is the logarithm of the damping; run 3 and every seventh after it diverged.
     """
     shutil.copy("speckle.png", "other.png")
 
-    def made(samples: int = 8, vary: dict[str, Any] = VARY, **settings: Any) -> SweepState:
+    def make(samples: int = 8, vary: dict[str, Any] = VARY, **settings: Any) -> SweepState:
         described = make_sweep("small.yaml", {"vary": vary, "samples": samples, "seed": 1, **settings})
         values = described.values()
         outcomes = [
@@ -62,13 +62,13 @@ def make(small: Path, ran: Path) -> Make:
             else Outcome(run, "complete", "", np.log(row[0]), 0.9, None)
             for run, row in enumerate(values)
         ]
-        result = SweepState(small / "out", described, values, outcomes)
+        state = SweepState(small / "out", described, values, outcomes)
         for run in range(samples):
-            result.run_directory(run).mkdir(parents=True, exist_ok=True)
-            shutil.copy(ran / "run.json", result.run_directory(run))
-        return result
+            state.run_directory(run).mkdir(parents=True, exist_ok=True)
+            shutil.copy(ran / "run.json", state.run_directory(run))
+        return state
 
-    return made
+    return make
 
 
 def write(result: SweepState, executor: Executor | None = None) -> tuple[list[str], list[str]]:
@@ -77,7 +77,7 @@ def write(result: SweepState, executor: Executor | None = None) -> tuple[list[st
 
 
 def copy_runs(ran: Path, result: SweepState) -> None:
-    """Give every complete run the results of one."""
+    """Copy the results of a run to every complete run."""
     for outcome in result.outcomes:
         if outcome.status == "complete":
             shutil.copytree(ran, result.run_directory(outcome.run), dirs_exist_ok=True)
@@ -90,8 +90,8 @@ def test_captions_are_short(message: Messages) -> None:
     message(map(format_short, values))
 
 
-def test_the_split_follows_from_seed_and_number_alone() -> None:
-    # Pinned: data sets must keep their parts for ever.
+def test_splits_depend_on_seed_and_number() -> None:
+    # Pinned, as data sets must keep their splits.
     assert [run for run, part in enumerate(assign_splits(20, 1)) if part == "test"] == [1, 16]
     assert [run for run, part in enumerate(assign_splits(20, 1)) if part == "val"] == [11, 19]
     for runs, tenth in ((64, 6), (65, 7), (100, 10), (4, 0), (5, 1)):
@@ -100,7 +100,7 @@ def test_the_split_follows_from_seed_and_number_alone() -> None:
     assert assign_splits(64, 1) != assign_splits(64, 2)
 
 
-def test_parameters_are_the_numbers_that_vary(make: Make) -> None:
+def test_varied_parameters_and_results(make: Make) -> None:
     result = make()
     damping, place, image = varied_parameters(result, range(8))
     assert (damping.name, damping.is_logarithmic) == ("damping", True)
@@ -114,22 +114,16 @@ def test_parameters_are_the_numbers_that_vary(make: Make) -> None:
 
 
 def test_sensitivity_of_a_linear_function() -> None:
-    # The variances of 3 x and y are as 9 to 1. The largest error with the first 40 seeds is 0.09.
-    points = qmc.Sobol(2, seed=np.random.default_rng(0)).random(64)
-    for column, share in enumerate((0.9, 0.1)):
-        index, confidence = first_order_index(points[:, column], 3 * points[:, 0] + points[:, 1])
-        assert index == pytest.approx(share, abs=0.12)
-        assert abs(index - share) < confidence
-
-
-def test_sensitivity_in_a_grid() -> None:
-    # The runs of a grid go through one key for each value of the other.
+    """The variances of 3 x and y are as 9 to 1; the largest error with the first 40 seeds of the points is 0.09."""
     grid = np.array(list(itertools.product(range(8), range(8))), dtype=float)
-    indices = [first_order_index(column, 3 * grid[:, 0] + grid[:, 1])[0] for column in grid.T]
-    assert indices == pytest.approx([0.9, 0.1], abs=0.1)
+    for points in (qmc.Sobol(2, seed=np.random.default_rng(0)).random(64), grid):
+        for column, expected in zip(points.T, (0.9, 0.1), strict=True):
+            index, confidence = first_order_index(column, 3 * points[:, 0] + points[:, 1])
+            assert index == pytest.approx(expected, abs=0.12)
+            assert abs(index - expected) < confidence
 
 
-def test_sensitivity_is_written_from_64_complete_runs_on(make: Make) -> None:
+def test_sensitivity_needs_64_complete_runs(make: Make) -> None:
     assert write(make(64))[0] == ["table.csv", "table.parquet", "dataset.json", "sweep.png"]
     result = make(128)
     assert "sensitivity.csv" in write(result)[0]
@@ -142,7 +136,7 @@ def test_sensitivity_is_written_from_64_complete_runs_on(make: Make) -> None:
     assert shares == pytest.approx([1, 0, 0], abs=0.1)
 
 
-def test_the_picture_shows_every_run_but_damaged_ones(make: Make, ran: Path, message: Messages) -> None:
+def test_contact_sheet(make: Make, ran: Path, message: Messages) -> None:
     result = make()
     copy_runs(ran, result)
     names, notes = write(result)
@@ -150,7 +144,7 @@ def test_the_picture_shows_every_run_but_damaged_ones(make: Make, ran: Path, mes
     assert notes == []
     with Image.open(result.directory / "contact.jpg") as picture:
         pixels = np.asarray(picture).astype(int)
-    # Two rows of four frames of 40 x 30, made larger, with 20 pixels between them, and captions of some lines below.
+    # Two rows of four enlarged frames of 40 x 30 pixels, with gaps of 20 pixels and captions of some lines.
     width, height, above = 330, 248, 43
     rows = np.split(pixels[above : above + (len(pixels) - 63) // 2 * 2], 2)
     assert pixels.shape[1] == 20 + 4 * (width + 20)
@@ -161,7 +155,7 @@ def test_the_picture_shows_every_run_but_damaged_ones(make: Make, ran: Path, mes
     with Image.open(ran / "frames" / f"000{largest}.png") as frame:
         shown = np.asarray(frame.resize((width, height), Image.Resampling.LANCZOS)).astype(int)
     assert all(np.abs(tile - shown).mean() < 5 for run, tile in enumerate(tiles) if run != 3)
-    # A grey field, with a word.
+    # The tile of a run that diverged is grey, with a word.
     assert 0.97 < (np.abs(tiles[3] - 0xE6) <= 2).all(axis=2).mean() < 1
     damaged = result.run_directory(1) / "frames" / "0002.png"
     damaged.write_bytes(damaged.read_bytes()[:100])
@@ -170,22 +164,10 @@ def test_the_picture_shows_every_run_but_damaged_ones(make: Make, ran: Path, mes
     message(notes, "contact.jpg", "0002.png", hide=r"(?<=decoded).*")
 
 
-@pytest.mark.slow
-def test_the_same_results_give_the_same_bytes(make: Make, ran: Path) -> None:
-    result = make(128)
-    copy_runs(ran, result)
-    written = []
-    for _ in range(2):
-        names, _ = write(result)
-        written.append({name: (result.directory / name).read_bytes() for name in names})
-    assert written[0] == written[1]
-    assert len(written[0]) == 6
-
-
 @pytest.mark.default_cases("frames-0")
 @pytest.mark.parametrize(("kept", "difference"), [("frames", 0), ("animation.gif", 10), ("trajectory.npz", 0)])
-def test_the_frame_comes_from_any_output(make: Make, ran: Path, kept: str, difference: float, pool: Pool) -> None:
-    """An animation has fewer colours; what is drawn again is the same."""
+def test_frames_come_from_any_output(make: Make, ran: Path, kept: str, difference: float, pool: Pool) -> None:
+    """An animation has fewer colours; a redrawn frame is equal."""
     result = make(2)
     copy_runs(ran, result)
     write(result, pool)
@@ -197,24 +179,15 @@ def test_the_frame_comes_from_any_output(make: Make, ran: Path, kept: str, diffe
     assert np.abs(np.asarray(Image.open(result.directory / "contact.jpg")) - first).mean() <= difference
 
 
-def test_of_an_animation_the_picture_at_a_time_is_taken(tmp_path: Path) -> None:
+def test_picture_of_an_animation_at_a_time(tmp_path: Path) -> None:
     red, blue = (Image.new("RGB", (40, 30), colour) for colour in ("red", "blue"))
     red.save(tmp_path / "a.gif", save_all=True, append_images=[blue, red], duration=[40, 80, 40])
     for time, colour in ((0.039, (255, 0, 0)), (0.041, (0, 0, 255)), (0.119, (0, 0, 255)), (0.13, (255, 0, 0))):
         assert read_gif_frame(tmp_path / "a.gif", time).getcolors() == [(40 * 30, colour)]
 
 
-def test_without_pictures_there_is_a_note_and_no_earlier_picture(make: Make) -> None:
-    result = make()
-    (result.directory / "contact.jpg").touch()
-    names, notes = write(result)
-    assert notes == [WITHOUT_PICTURES]
-    assert "contact.jpg" not in names
-    assert not (result.directory / "contact.jpg").exists()
-
-
-def test_an_earlier_report_stays_until_its_successor_replaces_it(make: Make, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Also where the drawing is killed, and where other reports fail."""
+def test_earlier_reports_are_replaced_atomically(make: Make, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Also when the drawing is interrupted, or another report fails."""
     result = make(128)
     for name in REPORT_FILES:
         (result.directory / name).write_text("earlier")
@@ -236,7 +209,7 @@ def test_an_earlier_report_stays_until_its_successor_replaces_it(make: Make, mon
     assert notes[1].startswith("sweep.png could not be made: ")
 
 
-def test_without_libraries_there_are_notes(make: Make, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_missing_libraries(make: Make, monkeypatch: pytest.MonkeyPatch) -> None:
     for name in ("matplotlib", "SALib", "SALib.analyze", "pyarrow"):
         monkeypatch.setitem(sys.modules, name, None)
     monkeypatch.delitem(sys.modules, "taichi_msm.sweeps.plots", raising=False)
@@ -245,7 +218,7 @@ def test_without_libraries_there_are_notes(make: Make, monkeypatch: pytest.Monke
     assert notes == [WITHOUT_PICTURES, WITHOUT_SALIB, WITHOUT_MATPLOTLIB]
 
 
-def test_of_many_parameters_those_of_largest_sensitivity_are_plotted(make: Make) -> None:
+def test_plots_of_the_most_sensitive_parameters(make: Make) -> None:
     style = pytest.importorskip("matplotlib.style")
     from taichi_msm.sweeps.plots import PlotData, _figure
 
@@ -261,15 +234,15 @@ def test_of_many_parameters_those_of_largest_sensitivity_are_plotted(make: Make)
     assert len(varied) == 9
     assert len(names) == 8
     assert names[0] == "damping"
-    (left_out,) = {one.name for one in varied} - set(names)
-    assert min(indices, key=lambda index: index.first_order).parameter == left_out
-    assert f"Not shown, as less sensitive: {left_out}." in figure.get_supxlabel().replace("\n", " ")
-    # A cross for every run that failed, at the bottom edge.
+    (omitted,) = {parameter.name for parameter in varied} - set(names)
+    assert min(indices, key=lambda index: index.first_order).parameter == omitted
+    assert f"Not shown, as less sensitive: {omitted}." in figure.get_supxlabel().replace("\n", " ")
+    # Crosses at the bottom edge mark the failed runs.
     crosses = np.asarray(figure.axes[0].collections[1].get_offsets())
     assert crosses.tolist() == [[number, 0] for number in varied[0].numbers[failed]]
 
 
-def test_a_table_of_parquet_has_numbers_and_lists(make: Make) -> None:
+def test_types_of_the_parquet_table(make: Make) -> None:
     parquet = pytest.importorskip("pyarrow.parquet")
     result = make(8, {**VARY, "render.camera": {"choice": ["top", {"eye": [0, 0, 1], "target": [0, 0, 0]}]}})
     write(result)
@@ -280,7 +253,7 @@ def test_a_table_of_parquet_has_numbers_and_lists(make: Make) -> None:
         "damping": "double",
         "probes.0.at": "list<element: double>",
         "image": "string",
-        # Values of two types are text, as --set takes it.
+        # Values of two types become arguments of --set.
         "render.camera": "string",
         "status": "string",
         "error": "string",
@@ -290,24 +263,23 @@ def test_a_table_of_parquet_has_numbers_and_lists(make: Make) -> None:
     assert columns["damping"] == [row[0] for row in result.values]
     assert columns["probes.0.at"] == [row[1] for row in result.values]
     assert set(columns["render.camera"]) == {"top", '{"eye": [0, 0, 1], "target": [0, 0, 0]}'}
-    assert columns["max_displacement"] == [one.max_displacement for one in result.outcomes]
+    assert columns["max_displacement"] == [outcome.max_displacement for outcome in result.outcomes]
 
 
-def test_the_force_of_a_probe_has_a_column(make: Make) -> None:
-    """By another name where the key of this name varies."""
+def test_columns_of_forces(make: Make) -> None:
+    """It has another name if the key of this name varies."""
     result = make(8)
-    outcomes = [replace(one, forces=(1.5, None) if one.run == 2 else ()) for one in result.outcomes]
+    outcomes = [replace(outcome, forces=(1.5, None) if outcome.run == 2 else ()) for outcome in result.outcomes]
     columns = replace(result, outcomes=outcomes).columns()
     assert list(columns)[-3:] == ["probes.0.force", "probes.1.force", "seconds"]
     assert (columns["probes.0.force"][:4], columns["probes.1.force"][2]) == ([None, None, 1.5, None], None)
     named = make(8, {**VARY, "probes.0.force": {"choice": [[0, 0, -1000], [0, 0, -500]]}})
-    outcomes = [replace(one, forces=(1.5,)) for one in named.outcomes]
-    named = replace(named, outcomes=outcomes)
+    named = replace(named, outcomes=[replace(outcome, forces=(1.5,)) for outcome in named.outcomes])
     assert "probes.0.force.greatest" in named.columns()
     assert "probes.0.force" not in named.columns()
 
 
-def test_a_data_set_names_its_complete_runs_and_the_program(make: Make, ran: Path, root: Path) -> None:
+def test_content_of_a_data_set(make: Make, ran: Path, root: Path) -> None:
     result = make(20)
     write(result)
     described = json.loads((result.directory / "dataset.json").read_text())
@@ -326,7 +298,7 @@ def test_a_data_set_names_its_complete_runs_and_the_program(make: Make, ran: Pat
     assert described["commit"] == json.loads((ran / "run.json").read_text())["commit"] == expected
 
 
-def test_runs_of_a_data_set_have_their_own_size(small: Path, pool: Pool) -> None:
+def test_data_set_of_several_sizes(small: Path, pool: Pool) -> None:
     sizes = [[16, 12], [12, 16]]
     vary = {"render.size": {"grid": sizes}}
     overrides = {"time.duration": 0.1, "output": ["png"]}
@@ -341,12 +313,12 @@ def test_runs_of_a_data_set_have_their_own_size(small: Path, pool: Pool) -> None
     }
 
 
-def test_what_is_no_file_of_a_sweep_stays(make: Make, message: Messages) -> None:
+def test_foreign_files_stay(make: Make, message: Messages) -> None:
     result = make()
     shutil.rmtree(result.directory / "runs")
     for name in REPORT_FILES:
-        (result.directory / name).write_text("mine")
+        (result.directory / name).write_text("foreign")
         with message.raises(ForeignError, name):
             begin_sweep(result.sweep, result.directory)
-        assert (result.directory / name).read_text() == "mine"
+        assert (result.directory / name).read_text() == "foreign"
         (result.directory / name).unlink()

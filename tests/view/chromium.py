@@ -67,9 +67,9 @@ class Tab:
 
     async def value(self, expression: str) -> Any:
         """Evaluate JavaScript."""
-        found = await self.call("Runtime.evaluate", expression=expression, returnByValue=True, awaitPromise=True)
-        assert "exceptionDetails" not in found, found
-        return found["result"].get("value")
+        answer = await self.call("Runtime.evaluate", expression=expression, returnByValue=True, awaitPromise=True)
+        assert "exceptionDetails" not in answer, answer
+        return answer["result"].get("value")
 
     async def until(self, condition: str, seconds: float = 60.0) -> None:
         """Wait until JavaScript is true."""
@@ -80,7 +80,7 @@ class Tab:
         raise AssertionError(f"never true: {condition}; {self.faults}")
 
     async def mouse(self, kind: str, x: float, y: float, **more: Any) -> None:
-        """Move, press, release or turn the wheel at a place [px]."""
+        """Dispatch a mouse event at a position [px]."""
         await self.call("Input.dispatchMouseEvent", type=f"mouse{kind}", x=x, y=y, **more)
 
     async def key(self, text: str) -> None:
@@ -104,9 +104,9 @@ async def chromium(folder: Path) -> AsyncIterator[Tab]:
     )
     try:
         assert process.stderr is not None
-        while not (found := re.search(r"ws://\S+", (await process.stderr.readline()).decode())):
+        while not (address := re.search(r"ws://\S+", (await process.stderr.readline()).decode())):
             pass
-        connection = await websocket_connect(found[0], max_message_size=1 << 26)
+        connection = await websocket_connect(address[0], max_message_size=1 << 26)
         yield Tab(connection)
         connection.close()
         while await connection.read_message() is not None:

@@ -1,4 +1,4 @@
-"""A session in a browser: who may see it, who steers, what a page may say; and the page itself in Chromium."""
+"""A session in browsers: access, steering, messages, and the page in Chromium."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ import re
 import signal
 from collections.abc import AsyncIterator, Callable, Coroutine, Iterator
 from contextlib import ExitStack, asynccontextmanager, suppress
+from functools import wraps
 from io import BytesIO
 from pathlib import Path
 from typing import Any, ClassVar
@@ -38,7 +39,7 @@ WAIT_S = 20.0
 
 @pytest.fixture
 def session(small: Path, device: Device) -> Iterator[Session]:
-    """A session whose tissue is pressed at the middle of its picture of 120 x 100 pixels."""
+    """A session with a picture of 120 x 100 pixels, with tissue at its centre."""
     with ExitStack() as stack:
         scene = load_scene("small.yaml", TILTED)
         yield stack.enter_context(Session(scene, Captures(Path("captures"), "small.yaml"), threads=2))
@@ -57,7 +58,7 @@ async def served(session: Session, *origins: str) -> AsyncIterator[Server]:
 
 
 class Client:
-    """A page without a browser, which reads every picture."""
+    """A page without a browser, which acknowledges every picture."""
 
     opened: ClassVar[list[WebSocketClientConnection]] = []
 
@@ -67,18 +68,18 @@ class Client:
         self.texts: list[dict[str, Any]] = []
         self.jpeg = b""
 
-    async def say(self, *message: Any) -> None:
+    async def send(self, *message: Any) -> None:
         await self.connection.write_message(json.dumps(message))
 
     async def read(self) -> dict[str, Any] | None:
-        """Read a message; return the state in it, None for another one."""
+        """Read a message; return its state, or None if it has no state."""
         message = await asyncio.wait_for(self.connection.read_message(), WAIT_S)
         assert message is not None, f"closed: {self.connection.close_code}"
         if isinstance(message, str):
             self.texts.append(json.loads(message))
             return None
         with suppress(WebSocketClosedError):
-            await self.say("shown")
+            await self.send("shown")
         length = int.from_bytes(message[:4], "big")
         self.jpeg = message[4 + length :] or self.jpeg
         state: dict[str, Any] = json.loads(message[4 : 4 + length])
@@ -103,10 +104,18 @@ async def status(url: str, **headers: str) -> int:
         return error.code
 
 
-def run(scenario: Coroutine[Any, Any, None], caplog: pytest.LogCaptureFixture) -> None:
-    """Run a scenario, in which nothing is logged, such as a traceback; close its clients."""
+@pytest.fixture(autouse=True)
+def no_log(caplog: pytest.LogCaptureFixture) -> Iterator[None]:
+    """Require that nothing is logged, such as a traceback."""
+    caplog.set_level(logging.WARNING)
+    yield
+    assert not caplog.get_records("call")
 
-    async def whole() -> None:
+
+def run(scenario: Coroutine[Any, Any, None]) -> None:
+    """Run a scenario, and close its clients."""
+
+    async def with_clients() -> None:
         try:
             await scenario
         finally:
@@ -116,123 +125,114 @@ def run(scenario: Coroutine[Any, Any, None], caplog: pytest.LogCaptureFixture) -
                 while connection.close_code is None and await connection.read_message() is not None:
                     pass
 
-    with caplog.at_level(logging.WARNING):
-        asyncio.run(whole())
-    assert not caplog.records
+    asyncio.run(with_clients())
 
 
-def test_every_request_needs_the_token_and_a_known_origin(session: Session, caplog: pytest.LogCaptureFixture) -> None:
-    async def scenario() -> None:
-        async with served(session, "https://hub.example.org") as server:
-            root, _, token = server.url.rstrip("/").rpartition("/")
-            assert len(token) >= 32
-            port = root.rpartition(":")[2]
-            for name in PAGE:
-                assert await status(f"{server.url}{name}") == 200
-            assert await status(server.url.rstrip("/")) == 200, "it leads to the page"
-            for path in ("x", "socket/", "../view.js", "%2e%2e/server.py", "index.html", "page/index.html"):
-                assert await status(server.url + path) in (403, 404), path
-            for path in ("/", "/favicon.ico", f"/{token[:-1]}/", f"/{token}0/", "/socket", "/%ff/", f"/x/{token}/"):
-                assert await status(root + path) == 403, path
+def scenario(test: Callable[..., Coroutine[Any, Any, None]]) -> Callable[..., None]:
+    """Convert a coroutine function to a test."""
+
+    @wraps(test)
+    def synchronous(*arguments: Any, **fixtures: Any) -> None:
+        run(test(*arguments, **fixtures))
+
+    return synchronous
+
+
+@scenario
+async def test_requests_need_the_token_and_a_known_origin(session: Session) -> None:
+    async with served(session, "https://hub.example.org") as server:
+        root, _, token = server.url.rstrip("/").rpartition("/")
+        assert len(token) >= 32
+        port = root.rpartition(":")[2]
+        for name in PAGE:
+            assert await status(f"{server.url}{name}") == 200
+        assert await status(server.url.rstrip("/")) == 200, "it is redirected to the page"
+        for path in ("x", "socket/", "../view.js", "%2e%2e/server.py", "page/index.html"):
+            assert await status(server.url + path) in (403, 404), path
+        for path in ("/", f"/{token[:-1]}/", f"/{token}0/", "/socket", "/%ff/", f"/x/{token}/"):
+            assert await status(root + path) == 403, path
+        with pytest.raises(HTTPClientError, match="403"):
+            await websocket_connect(f"ws://127.0.0.1:{port}/{token[1:]}/socket")
+        loopback = [f"http://{name}:{port}" for name in ("127.0.0.1", "localhost", "[::1]")]
+        for origin in (*loopback, "https://hub.example.org"):
+            client = await connect(server, Origin=origin)
+            assert await status(server.url, Origin=origin) == 200
+            client.connection.close()
+        for origin in ("https://evil.example.org", "null", "http://localhost:1", f"https://localhost:{port}", ""):
+            assert await status(server.url, Origin=origin) == 403, origin
             with pytest.raises(HTTPClientError, match="403"):
-                await websocket_connect(f"ws://127.0.0.1:{port}/{token[1:]}/socket")
-            own = [f"http://{name}:{port}" for name in ("127.0.0.1", "localhost", "[::1]")]
-            for origin in (*own, "https://hub.example.org"):
-                client = await connect(server, Origin=origin)
-                assert await status(server.url, Origin=origin) == 200
-                client.connection.close()
-            for origin in (
-                "https://evil.example.org",
-                "null",
-                "http://localhost:1",
-                f"https://localhost:{port}",
-                "",
-                "a:b",
-            ):
-                assert await status(server.url, Origin=origin) == 403, origin
-                with pytest.raises(HTTPClientError, match="403"):
-                    await connect(server, Origin=origin)
-            # As ssh -L has it, and as a name that an attacker has rebound.
-            assert await status(server.url, Origin="http://localhost:9", Host="localhost:9") == 200
-            assert await status(server.url, Origin="http://evil.org:9", Host="evil.org:9") == 403
-
-    run(scenario(), caplog)
+                await connect(server, Origin=origin)
+        # The port that ssh -L forwards, and DNS rebinding by an attacker.
+        assert await status(server.url, Origin="http://localhost:9", Host="localhost:9") == 200
+        assert await status(server.url, Origin="http://evil.org:9", Host="evil.org:9") == 403
 
 
-def test_the_page_has_no_url_but_relative_ones() -> None:
+def test_page_has_relative_urls() -> None:
     page = Path(main.__code__.co_filename).parents[1] / "view" / "page"
     text = "".join(path.read_text("utf-8") for path in page.iterdir()).replace("http://www.w3.org/2000/svg", "")
     assert not re.search(r"https?://|(src|href)=\"/", text)
 
 
-def test_the_first_page_steers_and_the_next_one_when_it_leaves(
-    session: Session, caplog: pytest.LogCaptureFixture
-) -> None:
-    async def scenario() -> None:
-        async with served(session) as server:
-            first, second = await connect(server), await connect(server)
-            await second.say("press", 60, 50)
-            state = await second.until(lambda state: state["time"] > 0.1)
-            assert (state["steers"], state["watching"], session.tool.engaged) == (False, 1, False)
-            await first.say("press", 60, 50)
-            await first.until(lambda state: any(depth > 2e-3 for _, _, depth in state["readings"]))
-            # The whole force acts after a fifth of a second.
-            pressed = session.frame / session.frame_rate
-            state = await first.until(lambda state: state["time"] > pressed + 0.3)
-            assert state["steers"]
-            time, force, _ = state["readings"][-1]
-            assert time == pytest.approx(state["time"], rel=1e-4)
-            assert force == pytest.approx(session.tool_force(), rel=1e-4)
-            assert force > 0
-            await second.until(lambda state: any(depth > 2e-3 for _, _, depth in state["readings"]))
-            first.connection.close()
-            await second.until(lambda state: state["steers"])
-            assert not session.tool.engaged, "the tool lets go"
-            second.connection.close()
-            await asyncio.sleep(0.3)
-            frame = session.frame
-            await asyncio.sleep(0.3)
-            assert session.frame == frame, "without a page the session waits"
-
-    run(scenario(), caplog)
+@scenario
+async def test_one_page_steers(session: Session) -> None:
+    async with served(session) as server:
+        first, second = await connect(server), await connect(server)
+        await second.send("press", 60, 50)
+        state = await second.until(lambda state: state["time"] > 0.1)
+        assert (state["steers"], state["watching"], session.tool.engaged) == (False, 1, False)
+        await first.send("press", 60, 50)
+        await first.until(lambda state: any(depth > 2e-3 for _, _, depth in state["readings"]))
+        # The full force acts after 0.2 s.
+        pressed = session.frame / session.frame_rate
+        state = await first.until(lambda state: state["time"] > pressed + 0.3)
+        assert state["steers"]
+        time, force, _ = state["readings"][-1]
+        assert time == pytest.approx(state["time"], rel=1e-4)
+        assert force == pytest.approx(session.tool_force(), rel=1e-4)
+        assert force > 0
+        await second.until(lambda state: any(depth > 2e-3 for _, _, depth in state["readings"]))
+        first.connection.close()
+        await second.until(lambda state: state["steers"])
+        assert not session.tool.engaged, "the tool is released"
+        second.connection.close()
+        await asyncio.sleep(0.3)
+        frame = session.frame
+        await asyncio.sleep(0.3)
+        assert session.frame == frame, "without a page the session waits"
 
 
-def test_the_page_gets_the_picture_and_changes_the_material(session: Session, caplog: pytest.LogCaptureFixture) -> None:
-    async def scenario() -> None:
-        async with served(session) as server:
-            client = await connect(server)
-            await client.say("press", 60, 50)
-            soft = (await client.until(lambda state: state["time"] > 0.8))["readings"][-1][2]
-            (width, height), *_ = [text["size"] for text in client.texts]
-            with Image.open(BytesIO(client.jpeg)) as picture:
-                assert picture.size == (width, height) == (120, 100)
-            entry = next(entry for entry in client.texts[0]["material"] if entry["key"] == "springs.structural")
-            before = session.positions().copy()
-            await client.say("material", entry["key"], 8 * entry["initial"])
-            state = await client.until(lambda state: state["material"][entry["key"]] == 160)
-            assert state["time"] > 0.8, "it goes on"
-            assert np.abs(session.positions() - before).max() < 0.05 * np.ptp(before[..., 0])
-            stiff = (await client.until(lambda after: after["time"] > state["time"] + 0.8))["readings"][-1][2]
-            assert 0 < stiff < 0.9 * soft
-            await client.say("key", "w")
-            assert "material" in (await client.until(lambda state: state["notice"] != ""))["notice"]
-            await client.say("material", "springs.structural", 1e9)
-            assert "springs" in (await client.until(lambda state: state["notice"][:7] == "springs"))["notice"]
-            await client.say("key", "r")
-            await client.until(lambda state: state["time"] < 0.5)
-            await client.say("key", "w")
-            await client.until(lambda state: "session-1" in state["notice"])
-            springs = load_scene("captures/session-1.yaml").springs
-            assert springs is not None
-            assert springs.structural == 160
-
-    run(scenario(), caplog)
+@scenario
+async def test_page_changes_the_material(session: Session) -> None:
+    async with served(session) as server:
+        client = await connect(server)
+        await client.send("press", 60, 50)
+        soft = (await client.until(lambda state: state["time"] > 0.8))["readings"][-1][2]
+        (width, height), *_ = [text["size"] for text in client.texts]
+        with Image.open(BytesIO(client.jpeg)) as picture:
+            assert picture.size == (width, height) == (120, 100)
+        entry = next(entry for entry in client.texts[0]["material"] if entry["key"] == "springs.structural")
+        await client.send("material", entry["key"], 8 * entry["initial"])
+        state = await client.until(lambda state: state["material"][entry["key"]] == 160)
+        stiff = (await client.until(lambda after: after["time"] > state["time"] + 0.8))["readings"][-1][2]
+        assert 0 < stiff < 0.9 * soft
+        for message, notice in (
+            (("key", "w"), "material changed"),
+            (("material", "springs.structural", 1e9), "springs.structural"),
+            (("key", "r"), ""),
+            (("key", "w"), "session-1"),
+        ):
+            await client.send(*message)
+            while notice not in (await client.until(lambda state: True))["notice"]:
+                pass
+        springs = load_scene("captures/session-1.yaml").springs
+        assert springs is not None
+        assert springs.structural == 160
 
 
 MALFORMED = [
-    *("", "{", "[]", "[[]]", "{}", "1", '"press"', '["jump"]', '["press"]', '["press", 1, NaN]', '["press", 1e999, 1]'),
-    *('["press", "1", 2]', '["press", 1, 2, 3]', '["press", 1, 2, true, 4]', '["press", true, 1]', '["release", 1]'),
-    *('["key", "x"]', '["key", null]', '["material", "sheet.size", 1]', '["turn", 1e13, 0]', "[" * MAX_BYTES),
+    *("{", "[]", "[[]]", "{}", '"press"', '["jump"]', '["press"]', '["press", 1, NaN]', '["press", 1e999, 1]'),
+    *('["press", "1", 2]', '["press", 1, 2, true, 4]', '["press", true, 1]', '["release", 1]'),
+    *('["key", "x"]', '["material", "sheet.size", 1]', '["turn", 1e13, 0]', "[" * MAX_BYTES),
     f'["turn", {"9" * 400}, 1]',
 ]
 
@@ -242,66 +242,60 @@ MALFORMED = [
     ['["jump"]', '["press", 1, NaN]', '["key", "x"]', '["material", "sheet.size", 1]'],
     ids=lambda text: text[2:5],
 )
-def test_what_is_wrong_with_a_message(text: str, message: Messages) -> None:
+def test_faults_of_messages(text: str, message: Messages) -> None:
     with message.raises(ValueError):
         parse_message(text)
 
 
-def test_malformed_messages_are_refused_and_the_session_goes_on(
-    session: Session, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    async def scenario() -> None:
-        async with served(session) as server:
-            client = await connect(server)
-            messages: list[str | bytes] = [*MALFORMED, b"\xff\xfe\x00"]
-            for text in messages:
-                await client.connection.write_message(text, binary=isinstance(text, bytes))
-            while len(client.texts) < 1 + len(messages):
-                await client.read()
-            assert all("error" in text for text in client.texts[1:])
-            await client.connection.write_message("[" + " " * MAX_BYTES + "]")
-            with pytest.raises(AssertionError, match="closed: 1009"):
-                await client.until(lambda state: False)
-            client = await connect(server)
-            monkeypatch.setattr(server_module, "MAX_EVENTS", 5)
-            for _ in range(50):
-                client.connection.write_message('["hover", 1, 1]')
-            with pytest.raises(AssertionError, match="closed: 1008"):
-                await client.until(lambda state: False)
-            crowd = [await connect(server) for _ in range(MAX_PAGES + 1)]
-            with pytest.raises(AssertionError, match="closed: 1013"):
-                await crowd[-1].read()
-            assert await crowd[0].until(lambda state: state["steers"])
-
-    run(scenario(), caplog)
+@scenario
+async def test_malformed_messages_and_floods_are_refused(session: Session, monkeypatch: pytest.MonkeyPatch) -> None:
+    async with served(session) as server:
+        client = await connect(server)
+        messages: list[str | bytes] = [*MALFORMED, b"\xff\xfe\x00"]
+        for text in messages:
+            await client.connection.write_message(text, binary=isinstance(text, bytes))
+        while len(client.texts) < 1 + len(messages):
+            await client.read()
+        assert all("error" in text for text in client.texts[1:])
+        await client.connection.write_message("[" + " " * MAX_BYTES + "]")
+        with pytest.raises(AssertionError, match="closed: 1009"):
+            await client.until(lambda state: False)
+        client = await connect(server)
+        monkeypatch.setattr(server_module, "MAX_EVENTS", 5)
+        for _ in range(50):
+            client.connection.write_message('["hover", 1, 1]')
+        with pytest.raises(AssertionError, match="closed: 1008"):
+            await client.until(lambda state: False)
+        crowd = [await connect(server) for _ in range(MAX_PAGES + 1)]
+        with pytest.raises(AssertionError, match="closed: 1013"):
+            await crowd[-1].read()
+        assert await crowd[0].until(lambda state: state["steers"])
 
 
-def test_a_page_that_does_not_read_gets_few_pictures(session: Session, caplog: pytest.LogCaptureFixture) -> None:
-    async def scenario() -> None:
-        async with served(session) as server:
-            slow, quick = await connect(server), await connect(server)
-            await quick.until(lambda state: state["time"] > 1)
-            await slow.read()
-            states = 0
-            while True:
-                try:
-                    await asyncio.wait_for(slow.connection.read_message(), 0.5)
-                    states += 1
-                except TimeoutError:
-                    break
-            assert states == MAX_UNREAD_PICTURES
-
-    run(scenario(), caplog)
+@scenario
+async def test_slow_page_gets_few_pictures(session: Session) -> None:
+    async with served(session) as server:
+        slow, fast = await connect(server), await connect(server)
+        await fast.until(lambda state: state["time"] > 1)
+        await slow.read()
+        states = 0
+        while True:
+            try:
+                await asyncio.wait_for(slow.connection.read_message(), 0.5)
+                states += 1
+            except TimeoutError:
+                break
+        assert states == MAX_UNREAD_PICTURES
 
 
-def test_an_interruption_tells_the_pages_and_keeps_the_film(session: Session, caplog: pytest.LogCaptureFixture) -> None:
+def test_interruption_reaches_the_pages_and_saves_the_film(session: Session) -> None:
     interrupted = asyncio.Event()
 
     def pause() -> None:
         if interrupted.is_set():
             raise KeyboardInterrupt
 
-    async def scenario() -> None:
+    async def steps() -> None:
         server = Server(session, listen(0), "small.yaml")
         session.start_film(Path("live.mp4"))
         running = asyncio.create_task(server.run(pause))
@@ -313,30 +307,28 @@ def test_an_interruption_tells_the_pages_and_keeps_the_film(session: Session, ca
         await running
 
     with pytest.raises(KeyboardInterrupt):
-        run(scenario(), caplog)
+        run(steps())
     session.close()
     assert Path("live.mp4").stat().st_size > 1000
     assert [path.name for path in Path().glob(".*")] == []
 
 
-def test_the_page_quits(session: Session, caplog: pytest.LogCaptureFixture) -> None:
-    async def scenario() -> None:
-        server = Server(session, listen(0), "small.yaml")
-        running = asyncio.create_task(server.run(lambda: None))
-        client = await connect(server)
-        await client.say("key", "q")
-        await asyncio.wait_for(running, WAIT_S)
-
-    run(scenario(), caplog)
+@scenario
+async def test_page_quits(session: Session) -> None:
+    server = Server(session, listen(0), "small.yaml")
+    running = asyncio.create_task(server.run(lambda: None))
+    client = await connect(server)
+    await client.send("key", "q")
+    await asyncio.wait_for(running, WAIT_S)
 
 
-def test_a_port_in_use_is_one_error(small: Path, capsys: pytest.CaptureFixture[str], message: Messages) -> None:
+def test_port_in_use(small: Path, capsys: pytest.CaptureFixture[str], message: Messages) -> None:
     with listen(0) as taken:
         assert main(["view", "small.yaml", "--browser", "--port", str(taken.getsockname()[1])]) == 2
     message(capsys.readouterr().err, hide=r"\d{4,}")
 
 
-def test_ctrl_c_ends_the_command(small: Path, program: Program, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_interruption_of_the_command(small: Path, program: Program, monkeypatch: pytest.MonkeyPatch) -> None:
     serve = Server.run
 
     async def interrupt(server: Server, pause: Pause) -> None:
@@ -353,40 +345,36 @@ def test_ctrl_c_ends_the_command(small: Path, program: Program, monkeypatch: pyt
 
 
 @pytest.mark.skipif(PROGRAM is None, reason="needs Chromium")
-def test_the_page_in_chromium(session: Session, tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
-    async def scenario() -> None:
-        async with served(session) as server, chromium(tmp_path / "profile") as tab:
-            await tab.open(server.url, 1280, 800)
-            await tab.until("state !== null && readings.length > 5")
-            left, top, width = await tab.value(
-                "(box => [box.left, box.top, box.width])(canvas.getBoundingClientRect())"
-            )
-            before = await tab.value("element('by-depth').toDataURL()")
-            x, y = left + 0.5 * width, top + 0.5 * width * 100 / 120
-            await tab.mouse("Moved", x, y)
-            await tab.mouse("Pressed", x, y, button="left", buttons=1, clickCount=1)
-            await tab.until("readings.at(-1)[2] > 2e-3")
-            assert session.depth() > 2e-3
-            assert np.array(session.tool.position) == pytest.approx([0.5, 0.5], abs=0.03)
-            await tab.mouse("Moved", x + 0.1 * width, y, button="left", buttons=1)
-            await tab.until("state.handled >= 3")
-            assert session.tool.target[0] > 0.52
-            await tab.until(f"element('by-depth').toDataURL() !== {json.dumps(before)}")
-            await tab.mouse("Released", x, y, button="left")
-            await tab.mouse("Wheel", x, y, deltaX=0, deltaY=200)
-            await tab.until("state.strength === 90 && element('strength').value === '90'")
-            await tab.key("m")
-            await tab.until("state.mesh && element('mesh').ariaPressed === 'true'")
-            await tab.key(" ")
-            await tab.until("state.paused")
-            # A telephone: nothing is cut off, and a finger presses.
-            await tab.resize(400, 800, touch=True)
-            handled = await tab.value("state.handled")
-            assert await tab.value("document.documentElement.scrollWidth") == 400
-            await tab.call("Input.dispatchTouchEvent", type="touchStart", touchPoints=[{"x": 200, "y": 150}])
-            await tab.until(f"state.handled > {handled}")
-            assert session.tool.engaged
-            await tab.call("Input.dispatchTouchEvent", type="touchEnd", touchPoints=[])
-            assert tab.faults == []
-
-    run(scenario(), caplog)
+@scenario
+async def test_page_in_chromium(session: Session, tmp_path: Path) -> None:
+    async with served(session) as server, chromium(tmp_path / "profile") as tab:
+        await tab.open(server.url, 1280, 800)
+        await tab.until("state !== null && readings.length > 5")
+        left, top, width = await tab.value("(box => [box.left, box.top, box.width])(canvas.getBoundingClientRect())")
+        before = await tab.value("element('by-depth').toDataURL()")
+        x, y = left + 0.5 * width, top + 0.5 * width * 100 / 120
+        await tab.mouse("Moved", x, y)
+        await tab.mouse("Pressed", x, y, button="left", buttons=1, clickCount=1)
+        await tab.until("readings.at(-1)[2] > 2e-3")
+        assert session.depth() > 2e-3
+        assert np.array(session.tool.position) == pytest.approx([0.5, 0.5], abs=0.03)
+        await tab.mouse("Moved", x + 0.1 * width, y, button="left", buttons=1)
+        await tab.until("state.handled >= 3")
+        assert session.tool.target[0] > 0.52
+        await tab.until(f"element('by-depth').toDataURL() !== {json.dumps(before)}")
+        await tab.mouse("Released", x, y, button="left")
+        await tab.mouse("Wheel", x, y, deltaX=0, deltaY=200)
+        await tab.until("state.strength === 90 && element('strength').value === '90'")
+        await tab.key("m")
+        await tab.until("state.mesh && element('mesh').ariaPressed === 'true'")
+        await tab.key(" ")
+        await tab.until("state.paused")
+        # The layout of a telephone, and touch.
+        await tab.resize(400, 800, touch=True)
+        handled = await tab.value("state.handled")
+        assert await tab.value("document.documentElement.scrollWidth") == 400
+        await tab.call("Input.dispatchTouchEvent", type="touchStart", touchPoints=[{"x": 200, "y": 150}])
+        await tab.until(f"state.handled > {handled}")
+        assert session.tool.engaged
+        await tab.call("Input.dispatchTouchEvent", type="touchEnd", touchPoints=[])
+        assert tab.faults == []

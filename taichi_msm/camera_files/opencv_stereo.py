@@ -1,15 +1,15 @@
-"""Calibrations of stereo pairs with a key per camera: OpenCV's stereoCalibrate, SCARED, STIR."""
+"""Stereo pairs with a key or section per camera, as of OpenCV's stereoCalibrate, SCARED and STIR."""
 
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from typing import Any
 
 from taichi_msm.camera_files.calibration import CalibrationReader, StereoPose
-from taichi_msm.camera_files.keys import Keys, flat, fold, listed
+from taichi_msm.camera_files.camera_file import CameraFile, Entries, listed
+from taichi_msm.camera_files.key_lookup import Keys, flat, fold
 from taichi_msm.camera_files.opencv import MATRIX, read_camera, read_pose
-from taichi_msm.camera_files.text import CameraFile
 
 # Marks of the left and the right camera, around the name of a key or as that of a section.
 MARKS = (
@@ -29,7 +29,7 @@ def _cameras(file: CameraFile) -> Sequence[Keys]:
         if all(any(len(flat(data[key])) == 9 for key in keys) for keys in matrices):
             shared = {key: fold(key) for key in data if not any(key in eye for eye in eyes)}
             folded = [{**shared, **eye} for eye in eyes]
-            return [Keys(file, {key: data[key] for key in names}, names) for names in folded]
+            return [Keys(file, {key: data[key] for key in names}, names, data.lines) for names in folded]
     return ()
 
 
@@ -37,17 +37,22 @@ def _pose(keys: Keys) -> StereoPose | None:
     """Read R and T; other keys must not contradict their unit or pose."""
     if names := keys.unread(r"units?|[rt]c?m+|rt|extrinsics?"):
         fault = f"{listed(names)}: not understood; write R, 3 x 3, and T, 3 numbers"
-        raise keys.file.fault(f"{fault}, in metres, or set calibration_unit: mm, and remove these")
+        raise keys.fault(f"{fault}, in metres, or set calibration_unit: mm, and remove these", names[0])
     return read_pose(keys)
 
 
-def _without_sections(data: Mapping[str, Any]) -> dict[str, Any]:
+def _without_sections(data: Entries) -> Entries:
     """Return the keys, those of sections after the name of the section, as left_K."""
     flattened: dict[str, Any] = {}
+    lines: dict[str, int] = {}
     for key, value in data.items():
-        is_section = isinstance(value, dict) and "data" not in value
-        flattened |= {f"{key}_{name}": inner for name, inner in value.items()} if is_section else {key: value}
-    return flattened
+        if isinstance(value, Entries) and "data" not in value:
+            flattened |= {f"{key}_{name}": inner for name, inner in value.items()}
+            lines |= {f"{key}_{name}": line for name, line in value.lines.items()}
+        else:
+            flattened[key] = value
+            lines |= {key: data.lines[key]} if key in data.lines else {}
+    return Entries(flattened, lines)
 
 
 def _marked(keys: Iterable[str], mark: str) -> dict[str, str]:

@@ -6,8 +6,7 @@ import re
 from collections.abc import Sequence
 from typing import NamedTuple
 
-from taichi_msm.camera_files.keys import listed
-from taichi_msm.camera_files.text import LENGTH_UNITS, CameraFile
+from taichi_msm.camera_files.camera_file import LENGTH_UNITS, CameraFile, listed
 from taichi_msm.camera_files.trajectory import COLUMNS, MAX_NUMBER, Trajectory, TrajectoryReader, parse_numbers
 from taichi_msm.errors import truncate
 

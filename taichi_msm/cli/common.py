@@ -22,7 +22,17 @@ EXIT_CODES = {"complete": DONE, "diverged": DIVERGED}
 
 
 def result_directory(out: str | None, default: str = "", option: str = "--out") -> Path:
-    """Return the directory of results that the user gave by an option, or a default one in output/."""
+    """Return the directory of results that the user gave, or a default one in output/.
+
+    Args:
+        out: value of the option; None if it is not given.
+        default: name of the default directory.
+        option: name of the option, for messages.
+
+    Raises:
+        click.BadParameter: when the value is empty, or the default is no name of a directory.
+        FilesError: when the default directory is reached by a symbolic link.
+    """
     if out == "":
         raise click.BadParameter("is empty; name a directory", param_hint=option)
     if out is not None:
@@ -62,7 +72,16 @@ def prefix_errors(scene: str) -> Iterator[None]:
 
 @contextmanager
 def show_progress(interruption: Interruption, quiet: bool) -> Iterator[Callable[[str, int, int], None]]:
-    """Show the progress of the block by a callback, which raises KeyboardInterrupt after an interruption."""
+    """Show the progress of the block.
+
+    Args:
+        interruption: is listened to from the first stage on.
+        quiet: whether to show nothing.
+
+    Yields:
+        A callback for the stage, the finished and the total number of items; it raises KeyboardInterrupt after an
+        interruption.
+    """
     from taichi_msm.cli.console import ProgressDisplay
 
     def progress(stage: str, done: int, total: int) -> None:
@@ -78,7 +97,19 @@ def show_progress(interruption: Interruption, quiet: bool) -> Iterator[Callable[
 
 @contextmanager
 def report_interruption(interruption: Interruption, as_json: bool, rest: Callable[[], str]) -> Iterator[None]:
-    """Report an interruption of the block, and exit; `rest` returns the end of the message."""
+    """Report an interruption of the block, and exit.
+
+    Args:
+        interruption: has the exit code.
+        as_json: whether to print the message as JSON, too.
+        rest: returns the end of the message.
+
+    Yields:
+        None, once.
+
+    Raises:
+        click.exceptions.Exit: in place of a KeyboardInterrupt of the block.
+    """
     try:
         yield
     except KeyboardInterrupt:
@@ -93,7 +124,17 @@ def interruptible(
     interruption: Interruption | None = None,
     rest: Callable[[], str] = lambda: "; nothing was written",
 ) -> Iterator[Callable[[str, int, int], None]]:
-    """Show the progress of the block by a callback; report an interruption, and exit."""
+    """Show the progress of the block; report an interruption, and exit.
+
+    Args:
+        as_json: whether the command prints JSON, and thus no progress.
+        quiet: whether to show no progress.
+        interruption: by default a new one.
+        rest: returns the end of the message of an interruption.
+
+    Yields:
+        The callback of `show_progress`.
+    """
     interruption = interruption or Interruption()
     with report_interruption(interruption, as_json, rest), show_progress(interruption, quiet or as_json) as progress:
         yield progress
@@ -105,7 +146,13 @@ def print_json(value: Any) -> None:
 
 
 def report_failure(status: str, lines: Sequence[str], as_json: bool) -> None:
-    """Print the failure of a command on stderr, and as a JSON object with a status on stdout."""
+    """Print the failure of a command on stderr.
+
+    Args:
+        status: error, diverged or interrupted, for JSON.
+        lines: the message.
+        as_json: whether to print it as a JSON object on stdout, too.
+    """
     write_stderr(lines)
     if as_json:
         print_json({"status": status, "errors": list(lines)})

@@ -1,14 +1,14 @@
-"""Keys of a calibration, which are looked up by any of their spellings."""
+"""Lookup of the keys of a calibration by any of their spellings."""
 
 from __future__ import annotations
 
 import math
 import re
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from itertools import zip_longest
 from typing import Any
 
-from taichi_msm.camera_files.text import MAX_DEPTH, CameraFile
+from taichi_msm.camera_files.camera_file import MAX_DEPTH, CameraFile, CameraFileError, Entries, listed
 from taichi_msm.errors import truncate
 
 # Largest number in a calibration.
@@ -19,23 +19,55 @@ ROUNDING_TOLERANCE = 1e-6
 
 
 class Keys:
-    """Values of a camera in a calibration, by names, which may be folded and without a mark of the camera."""
+    """Keys of one camera in a calibration.
 
-    def __init__(self, file: CameraFile, data: Mapping[str, Any], folded: Mapping[str, str] | None = None) -> None:
+    Args:
+        file: file of the calibration.
+        data: values by their names in the file.
+        folded: names as `fold` reduces them, without a mark of the camera, by those in the file; None for `fold`.
+        lines: lines of the names in the file, for messages; None for those of `data`.
+    """
+
+    def __init__(
+        self,
+        file: CameraFile,
+        data: Mapping[str, Any],
+        folded: Mapping[str, str] | None = None,
+        lines: Mapping[str, int] | None = None,
+    ) -> None:
         self.file = file
         self.data = data
         self.folded = {name: fold(name) for name in data} if folded is None else folded
+        self.lines = (data.lines if isinstance(data, Entries) else {}) if lines is None else lines
         self._read_names: set[str] = set()
 
     def __str__(self) -> str:
         return listed(self.data)
 
+    def fault(self, fault: str, name: str | None) -> CameraFileError:
+        """Return an error for the caller to raise.
+
+        Args:
+            fault: reason and remedy.
+            name: key, whose line is named; None for a fault of the file.
+        """
+        return self.file.fault(fault, None if name is None else self.lines.get(name))
+
     def values(self, spelling: str, kind: type = object) -> dict[str, Any]:
-        """Return the values of a type that are not empty, whose folded names match a spelling, by names."""
+        """Return the values that are not empty of the keys with a spelling, by names.
+
+        Args:
+            spelling: pattern of the folded name.
+            kind: type of the values.
+        """
         names = [name for name, value in self.data.items() if isinstance(value, kind)]
         matches = {name: self.data[name] for name in names if re.fullmatch(spelling, self.folded[name])}
         self._read_names |= matches.keys()
         return {name: value for name, value in matches.items() if value is not None and value != ""}
+
+    def find(self, spelling: str) -> str | None:
+        """Return the first name with a spelling, or None."""
+        return next(iter(self.values(spelling)), None)
 
     def numbers(self, spelling: str) -> list[float] | None:
         """Return the numbers of a key, or None if it is missing; the values of several matching keys must agree."""
@@ -46,15 +78,26 @@ class Keys:
         for name, values in others:
             pairs = zip_longest(numbers, values, fillvalue=0.0)
             if not all(math.isclose(a, b, rel_tol=ROUNDING_TOLERANCE) for a, b in pairs):
-                raise self.file.fault(f"{first} and {name} are not the same; keep the right one")
+                raise self.fault(f"{first} and {name} are not the same; keep the right one", name)
         return numbers
 
     def require(self, spelling: str, count: int, name: str) -> list[float]:
-        """Return the numbers of a required key, of which there must be `count`; `name` is for messages."""
+        """Return the numbers of a required key.
+
+        Args:
+            spelling: pattern of the folded name.
+            count: number of numbers.
+            name: name of the key for messages.
+
+        Raises:
+            CameraFileError: when the key is missing or has another number of numbers.
+        """
         numbers = self.numbers(spelling)
-        if numbers is None or len(numbers) != count:
-            fault = f"has no {name}" if numbers is None else f"{name}: {len(numbers)} numbers, where {count} belong"
-            raise self.file.fault(f"{fault}; found {self}; write what belongs there")
+        if numbers is None:
+            raise self.file.fault(f"has no {name}; found {self}; add it")
+        if len(numbers) != count:
+            fault = f"{name}: {len(numbers)} numbers, where {count} belong"
+            raise self.fault(f"{fault}; found {self}; write {count} numbers", self.find(spelling))
         return numbers
 
     def unread(self, spelling: str) -> list[str]:
@@ -68,28 +111,21 @@ class Keys:
         except (TypeError, ValueError, OverflowError):
             numbers = [math.nan]
         if isinstance(value, dict) and "data" not in value:
-            raise self.file.fault(f"{name}: has {listed(value)}; expected a matrix with rows, cols and data")
+            raise self.fault(f"{name}: has {listed(value)}; expected a matrix with rows, cols and data", name)
         # The comparison is false for NaN.
         if not all(abs(number) <= MAX_NUMBER for number in numbers):
             fault = f"{truncate(str(value))} is not a list of numbers up to {MAX_NUMBER:g}"
-            raise self.file.fault(f"{name}: {fault}; write it as OpenCV does")
+            raise self.fault(f"{name}: {fault}; write it as OpenCV does", name)
         rows, cols = (value.get(side) if isinstance(value, dict) else None for side in ("rows", "cols"))
         if isinstance(rows, int) and isinstance(cols, int) and rows * cols != len(numbers):
-            fault = f"has {len(numbers)} numbers, and {rows} rows of {cols}; write what belongs there"
-            raise self.file.fault(f"{name}: {fault}")
+            fault = f"has {len(numbers)} numbers, and {rows} rows of {cols}; write {rows * cols} numbers"
+            raise self.fault(f"{name}: {fault}", name)
         return numbers
 
 
 def fold(name: object) -> str:
     """Reduce a name to its lower-case letters and digits."""
     return re.sub(r"[^a-z0-9]", "", str(name).lower())
-
-
-def listed(names: Iterable[Any]) -> str:
-    """Format up to 12 names for a message."""
-    shown, names = 12, list(names)
-    more = f" and {len(names) - shown} more" if len(names) > shown else ""
-    return ", ".join(truncate(str(name)) for name in names[:shown]) + more
 
 
 def flat(value: Any) -> list[Any]:

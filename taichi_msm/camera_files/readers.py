@@ -1,24 +1,72 @@
-"""The table of readers of trajectories."""
+"""Reading of calibrations and trajectories, and the tables of their readers."""
 
 from __future__ import annotations
 
 import math
-from typing import NamedTuple
+from typing import Literal, NamedTuple
 
-from taichi_msm.camera_files.colmap import COLMAP_IMAGES
-from taichi_msm.camera_files.columns import TABLES
-from taichi_msm.camera_files.kitti import KITTI
-from taichi_msm.camera_files.text import LENGTH_UNITS, CameraFile
+import numpy as np
+
+from taichi_msm.camera_files.calibration import Calibration
+from taichi_msm.camera_files.camera_file import LENGTH_UNITS, CameraFile
+from taichi_msm.camera_files.camera_json import CAMERA_JSON
+from taichi_msm.camera_files.colmap import COLMAP_CAMERAS, COLMAP_IMAGES
+from taichi_msm.camera_files.kalibr import KALIBR
+from taichi_msm.camera_files.kitti_poses import KITTI
+from taichi_msm.camera_files.ocamcalib import OCAMCALIB
+from taichi_msm.camera_files.opencv import OPENCV
+from taichi_msm.camera_files.opencv_stereo import STEREO
+from taichi_msm.camera_files.stereomis import STEREOMIS
 from taichi_msm.camera_files.trajectory import Trajectory, TrajectoryReader, pose_fault
+from taichi_msm.camera_files.tum_euroc import TABLES
 
 # The first one that recognises a file reads it.
-READERS: tuple[TrajectoryReader, ...] = (COLMAP_IMAGES, KITTI, TABLES)
+CALIBRATION_READERS = (OCAMCALIB, COLMAP_CAMERAS, STEREOMIS, KALIBR, CAMERA_JSON, STEREO, OPENCV)
+TRAJECTORY_READERS: tuple[TrajectoryReader, ...] = (COLMAP_IMAGES, KITTI, TABLES)
 
-# Limit of the size of a file; COLMAP's contains the points of every picture.
-MAX_BYTES = 2**27
+# Cameras of a stereo pair in their order.
+EYES = ("left", "right")
 
 # Units of time by their number in a second.
 TIME_UNITS = {"s": 1.0, "ms": 1e3, "us": 1e6, "ns": 1e9}
+
+
+def read_calibration(
+    path: str, eye: Literal["left", "right"] = "left", unit: Literal["m", "mm"] | None = None
+) -> Calibration:
+    """Read a calibration.
+
+    Args:
+        path: path of the file.
+        eye: camera of a stereo pair; of the right one the pose is read as well.
+        unit: unit of lengths in the file; None for that of the format, or for metres where the format has none.
+
+    Returns:
+        The calibration, lengths in metres.
+
+    Raises:
+        CameraFileError: when the file is invalid or not supported; the message lists what was found.
+    """
+    file = CameraFile(path, max_bytes=2**22)
+    reader, cameras = next((reader, cameras) for reader in CALIBRATION_READERS if (cameras := reader.cameras(file)))
+    if eye == EYES[0] or len(cameras) < len(EYES):
+        calibration = reader.read(cameras[0])
+        if eye == EYES[0]:
+            return calibration
+        raise file.fault(f"{reader.name}: has one camera; name a file of a stereo pair, or remove calibration_eye")
+    calibration, pose = reader.read(cameras[1]), reader.pose(cameras[1])
+    if pose is None:
+        return calibration
+    # Cameras of a pair in metres are closer than half a metre; in millimetres, further apart than 0.5 mm.
+    if unit is None and reader.unit is None and max(map(abs, pose.translation)) > 0.5:
+        distances = ", ".join(f"{number:g}" for number in pose.translation)
+        raise file.fault(f"the cameras are [{distances}] m apart; set calibration_unit: mm, or m if that is right")
+    rotation = np.array(pose.rotation)
+    if not ((deviation := np.abs(rotation @ rotation.T - np.eye(3)).max()) <= 1e-3):
+        raise file.fault(f"R: R R^T differs from 1 by {deviation:.2g}; write the 3 x 3 numbers of a rotation")
+    scale = LENGTH_UNITS[unit] if unit is not None else reader.unit or 1.0
+    translation = tuple(scale * number for number in pose.translation)
+    return calibration._replace(right=pose._replace(translation=translation))
 
 
 class PoseKeys(NamedTuple):
@@ -44,8 +92,8 @@ def read_poses(path: str, keys: PoseKeys = PoseKeys()) -> tuple[tuple[float, ...
     Raises:
         CameraFileError: when the file is invalid or not supported; the message contains the line.
     """
-    file = CameraFile(path, MAX_BYTES)
-    trajectory = next(found for reader in READERS if (found := reader.read(file)) is not None)
+    file = CameraFile(path, max_bytes=2**27)  # COLMAP's contains the points of every picture
+    trajectory = next(found for reader in TRAJECTORY_READERS if (found := reader.read(file)) is not None)
     if not trajectory.rows:
         raise file.fault("no poses; expected lines t tx ty tz qx qy qz qw")
     scale = LENGTH_UNITS[_agreed(file, "poses_unit", keys.poses_unit, trajectory.length_unit) or "m"]
@@ -70,7 +118,7 @@ def _times(file: CameraFile, trajectory: Trajectory, keys: PoseKeys) -> list[flo
         times = [(number - numbers[0]) / spacing / keys.poses_rate for number in numbers]
     else:
         if keys.poses_rate is not None:
-            raise file.fault("has times of its own; remove poses_rate")
+            raise file.fault("has times; remove poses_rate")
         unit = _agreed(file, "poses_time", keys.poses_time, trajectory.time_unit)
         # In seconds they would be in the year 5138.
         if unit is None and max(map(abs, numbers)) > 1e11:

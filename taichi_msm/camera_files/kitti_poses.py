@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from taichi_msm.camera_files.text import CameraFile
+from taichi_msm.camera_files.camera_file import CameraFile
 from taichi_msm.camera_files.trajectory import NORM_TOLERANCE, Trajectory, TrajectoryReader, parse_numbers
 
 COUNT = 12
@@ -25,7 +25,7 @@ def _read(file: CameraFile) -> Trajectory | None:
         matrix = np.array(numbers).reshape(3, 4)
         rotation = matrix[:, :3]
         if abs(rotation @ rotation.T - np.eye(3)).max() > NORM_TOLERANCE or np.linalg.det(rotation) < 0:
-            raise file.fault("its first three columns are no rotation; write an orthonormal matrix", n)
+            raise file.fault("its first three columns are not a rotation; write an orthonormal matrix", n)
         rows.append([len(rows), *matrix[:, 3].tolist(), *Rotation.from_matrix(rotation).as_quat().tolist()])
     return Trajectory(rows, [n for n, _ in lines], has_times=False)
 

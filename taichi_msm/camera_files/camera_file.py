@@ -1,0 +1,253 @@
+"""Text file of a camera, and the parser of YAML, JSON, XML and ini files."""
+
+from __future__ import annotations
+
+import json
+import re
+from collections.abc import Iterable, Mapping
+from configparser import ConfigParser, DuplicateOptionError, DuplicateSectionError
+from configparser import Error as ConfigError
+from functools import cached_property
+from typing import Any
+
+import yaml
+
+from taichi_msm.errors import truncate
+from taichi_msm.images import actual_path
+from taichi_msm.system.files import read_regular
+
+# Units of lengths [m].
+LENGTH_UNITS = {"m": 1.0, "mm": 1e-3}
+
+# Largest depth of nested values. Matrices are nested two or three deep.
+MAX_DEPTH = 20
+
+# Comments and empty lines; a section of an ini file after them; OpenCV's directive, which is not valid YAML.
+_COMMENTS = r"((?:[ \t]*(?:[#;][^\n]*)?\r?\n)*)"
+_INI = re.compile(_COMMENTS + r"[ \t]*\[[^\]\n=,]*\][ \t]*\r?\n" + _COMMENTS + r"[^\n]*=")
+_DIRECTIVE = re.compile(_COMMENTS + r"%YAML[^\n]*")
+
+# Errors of Python's and PyYAML's parsers for invalid content.
+_PARSER_ERRORS = (
+    *(ArithmeticError, AttributeError, LookupError, RecursionError, SyntaxError, TypeError, ValueError),
+    *(ConfigError, yaml.YAMLError),
+)
+
+
+class Entries(dict[str, Any]):
+    """Keys and values of a file or of a section of it.
+
+    Args:
+        values: values by keys.
+        lines: number of the line of each key, counted from 1; empty for JSON and XML, whose parsers drop it.
+    """
+
+    def __init__(self, values: Mapping[str, Any], lines: Mapping[str, int]) -> None:
+        super().__init__(values)
+        self.lines = lines
+
+
+class CameraFileError(Exception):
+    """The file cannot be used; the message contains its name, the line where it is known, the reason and the remedy."""
+
+
+class _ContentError(Exception):
+    """Invalid content, with its line counted from 1."""
+
+    def __init__(self, fault: str, line: int | None = None) -> None:
+        super().__init__(fault)
+        self.line = line
+
+
+class CameraFile:
+    """A text file of a camera.
+
+    Args:
+        path: path of the file.
+        max_bytes: largest size of the file.
+
+    Raises:
+        CameraFileError: when the file cannot be read.
+    """
+
+    def __init__(self, path: str, max_bytes: int) -> None:
+        self.path = path
+        self.text = _read(path, max_bytes)
+
+    def fault(self, fault: str, line: int | None = None) -> CameraFileError:
+        """Return an error for the caller to raise.
+
+        Args:
+            fault: reason and remedy.
+            line: number of the line, counted from 1; None where it is unknown.
+        """
+        return CameraFileError(f"{self.path}{'' if line is None else f':{line}'}: {fault}")
+
+    @cached_property
+    def data(self) -> Entries:
+        """Keys and values of YAML, JSON, XML or an ini file.
+
+        Raises:
+            CameraFileError: when the file has another format.
+        """
+        try:
+            data = _parse(self.text)
+        except _ContentError as error:
+            raise self.fault(str(error), error.line) from None
+        except _PARSER_ERRORS as error:
+            mark = getattr(error, "problem_mark", None)
+            line = mark.line + 1 if mark else getattr(error, "lineno", None)
+            raise self.fault("neither YAML, XML, JSON nor an ini file; name a calibration", line) from None
+        if not isinstance(data, Entries):
+            content = "a list" if isinstance(data, list) else "no keys"
+            raise self.fault(f"has {content}; expected camera_matrix and distortion_coefficients as keys")
+        return data
+
+
+def listed(names: Iterable[Any]) -> str:
+    """Format up to 12 names for a message."""
+    shown, names = 12, list(names)
+    more = f" and {len(names) - shown} more" if len(names) > shown else ""
+    return ", ".join(truncate(str(name)) for name in names[:shown]) + more
+
+
+def _read(name: str, max_bytes: int) -> str:
+    try:
+        return read_regular(actual_path(name), max_bytes).decode("utf-8-sig")
+    except UnicodeDecodeError:
+        raise CameraFileError(f"{name}: not UTF-8; name a text file") from None
+    except (OSError, ValueError) as error:
+        reason = error.strerror if isinstance(error, OSError) and error.strerror else "not a path"
+        raise CameraFileError(f"{name}: {reason.lower()}; name a calibration or a trajectory") from None
+
+
+def _parse(text: str) -> Any:
+    if text.lstrip().startswith("<"):
+        return _xml(text)
+    if text.lstrip().startswith("{"):
+        return _json(text)
+    return _ini(text) if _INI.match(text) else _yaml(text)
+
+
+def _truncated(text: str, kind: str) -> _ContentError:
+    """Return the fault of a file that ends before its last bracket or tag."""
+    lines = text.rstrip().splitlines()
+    fault = f"truncated {kind}, the file ends after {lines[-1][-30:].strip()!r}"
+    return _ContentError(f"{fault}; copy or export the whole file again", len(lines))
+
+
+def _entries(items: Iterable[tuple[Any, Any, int | None]]) -> Entries:
+    """Build the entries of keys, values and lines; a repeated key is an error."""
+    values: dict[Any, Any] = {}
+    lines: dict[Any, int] = {}
+    for name, value, line in items:
+        if name in values:
+            raise _ContentError(f"{truncate(str(name))} is given twice; keep the right one", line)
+        values[name] = value
+        if line is not None:
+            lines[name] = line
+    return Entries(values, lines)
+
+
+def _json(text: str) -> Any:
+    try:
+        return json.loads(text, object_pairs_hook=lambda pairs: _entries((*pair, None) for pair in pairs))
+    except json.JSONDecodeError as error:
+        # At the end of the text, or within its last word, or in a string that is not closed.
+        if error.msg.startswith("Unterminated") or re.fullmatch(r"[\w.+\\-]*\s*", text[error.pos :]):
+            raise _truncated(text, "JSON") from None
+        place = f"not JSON from column {error.colno} on"
+        raise _ContentError(f"{place}; correct it, or export the calibration again", error.lineno) from None
+
+
+# The C parser is twenty times faster than the one in Python.
+_BaseLoader: Any = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
+
+
+class _Loader(_BaseLoader):  # type: ignore[misc]
+    """YAML loader that reads OpenCV's matrices as mappings, and rejects repeated keys."""
+
+
+def _mapping(loader: _Loader, node: yaml.MappingNode) -> Entries:
+    return _entries(
+        (
+            loader.construct_object(name, deep=True),
+            loader.construct_object(value, deep=True),
+            name.start_mark.line + 1,
+        )
+        for name, value in node.value
+    )
+
+
+for _kind in ("opencv-matrix", "opencv-nd-matrix", "map"):
+    _Loader.add_constructor(f"tag:yaml.org,2002:{_kind}", _mapping)
+# PyYAML's own tag of tuples.
+_Loader.add_constructor("tag:yaml.org,2002:python/tuple", lambda loader, node: loader.construct_sequence(node, True))
+
+
+def _yaml(text: str) -> Any:
+    """Parse YAML, also with OpenCV's directive in the first line, which is not valid YAML."""
+    text = _DIRECTIVE.sub(r"\1", text, count=1)
+    # Nested aliases, deep nesting and very many values would take unlimited time, and no calibration has them.
+    depth, max_events = 0, 200_000
+    try:
+        for count, event in enumerate(yaml.parse(text, _BaseLoader)):
+            depth += isinstance(event, yaml.CollectionStartEvent) - isinstance(event, yaml.CollectionEndEvent)
+            if isinstance(event, yaml.AliasEvent) or depth > MAX_DEPTH or count > max_events:
+                raise ValueError
+        # The output of a ROS topic has a document for every message, all with equal content.
+        return next(yaml.load_all(text, _Loader), None)
+    except yaml.constructor.ConstructorError as error:
+        if not str(error.problem).startswith("could not det"):
+            raise
+        tag = truncate(str(error.problem)).partition(" for the ")[2]
+        line = error.problem_mark.line + 1 if error.problem_mark else None
+        raise _ContentError(f"{tag}: not plain YAML; write numbers and lists", line) from None
+    except yaml.MarkedYAMLError as error:
+        mark = error.problem_mark
+        if mark and not "\n".join(text.splitlines()[mark.line :])[mark.column :].strip():
+            raise _truncated(text, "YAML") from None
+        raise
+
+
+def _xml(text: str) -> Entries:
+    """Parse OpenCV's XML, in which matrices have `data` and numbers are text."""
+    from xml.etree import ElementTree
+    from xml.parsers.expat.errors import XML_ERROR_NO_ELEMENTS, XML_ERROR_UNCLOSED_TOKEN, messages
+
+    # Declarations could define entities that expand to any size.
+    if "<!" in text.replace("<!--", ""):
+        raise ValueError
+    try:
+        root = ElementTree.fromstring(text)
+    except ElementTree.ParseError as error:
+        if messages[error.code] in (XML_ERROR_NO_ELEMENTS, XML_ERROR_UNCLOSED_TOKEN):
+            raise _truncated(text, "XML") from None
+        fault = f"not XML from column {error.position[1] + 1} on; correct it, or export the calibration again"
+        raise _ContentError(fault, error.position[0]) from None
+    items: list[tuple[str, Any, None]] = []
+    for element in root:
+        data = element.find("data")
+        words = (element.text or "") if data is None else (data.text or "")
+        items.append((element.tag, words.strip() if data is None else {"data": words.split()}, None))
+    return _entries(items)
+
+
+def _ini(text: str) -> Entries:
+    """Parse an ini file; its keys are in lower case."""
+    parser = ConfigParser(interpolation=None, inline_comment_prefixes=("#", ";"))
+    try:
+        parser.read_string(text)
+    except (DuplicateOptionError, DuplicateSectionError) as error:
+        name = error.option if isinstance(error, DuplicateOptionError) else error.section
+        raise _ContentError(f"{truncate(name)} is given twice; keep the right one", error.lineno) from None
+    headers: dict[str, int] = {}
+    keys: dict[str, dict[str, int]] = {}
+    section = ""
+    for n, line in enumerate(text.splitlines(), 1):
+        if header := re.match(r"\s*\[(.+)\]", line):
+            section = header[1]
+            headers[section] = n
+        elif entry := re.match(r"\s*([^#;=:]+?)\s*[=:]", line):
+            keys.setdefault(section, {}).setdefault(entry[1].lower(), n)
+    return Entries({name: Entries(parser[name], keys.get(name, {})) for name in parser.sections()}, headers)
