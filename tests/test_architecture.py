@@ -8,8 +8,6 @@ import sys
 from functools import cache
 from pathlib import Path
 
-import pytest
-
 PACKAGE = Path(__file__).parent.parent / "taichi_msm"
 
 # A module or a package imports from earlier lines, and a package from itself.
@@ -132,7 +130,7 @@ assert not {"taichi", "quadrants", "numpy"} & set(sys.modules)
 from taichi_msm.cli.main import main
 for command in (["--help"], ["schema"], ["check", "scenes/press.yaml"]):
     main(command)
-assert not {"taichi", "quadrants", "rich"} & set(sys.modules)
+assert not {"taichi", "quadrants", "rich", "tornado"} & set(sys.modules)
 """
 
 
@@ -143,18 +141,3 @@ def test_light_commands_load_no_compiler(root: Path) -> None:
 def test_only_the_server_of_sessions_imports_tornado() -> None:
     assert [path.stem for path in MODULES if "tornado" in third_party(path)] == ["server"]
     assert [path.stem for path in MODULES if "view.server" in imports(path)] == ["study"]
-
-
-@pytest.mark.slow
-def test_only_sessions_load_tornado(small: Path) -> None:
-    commands = [
-        ["check", "small.yaml"],
-        ["run", "small.yaml", "--quiet"],
-        ["export", "output/small", "--format", "obj", "--quiet"],
-        ["view", "small.yaml", "--record", "a.gif", "--seconds", "0.2"],
-    ]
-    code = (
-        f"import sys; from taichi_msm.cli.main import main; codes = [main(words) for words in {commands}]; "
-        "sys.exit(any(codes) or 'tornado' in sys.modules)"
-    )
-    subprocess.run([sys.executable, "-c", code], check=True, stdout=subprocess.DEVNULL)
