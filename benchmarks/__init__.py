@@ -1,1 +1,1 @@
-"""How fast the program is beside others that do the same work: `python -m benchmarks`."""
+"""Speed of the program against other implementations of the same work: `python -m benchmarks`."""

@@ -2,8 +2,8 @@
 
     python -m benchmarks [--quick] [PART ...]
 
-Without a part all are measured. What was measured is kept in output/benchmarks, so that a part can be measured again
-by itself; `page` measures nothing and makes the page again. Nothing else should run meanwhile.
+Without a part all are measured. Results stay in output/benchmarks, so that a part can be measured again alone; `page`
+only writes the page again. Nothing else should run meanwhile.
 """
 
 from __future__ import annotations
@@ -21,18 +21,18 @@ from benchmarks.process import CACHE, OUTPUT, ROOT
 
 
 def progress(text: str) -> None:
-    """Tell what is being measured."""
+    """Report the current measurement."""
     print(text, file=sys.stderr, flush=True)
 
 
-def keep(results: dict[str, Any], path: Path) -> None:
-    """Write what is known so far."""
+def save(results: dict[str, Any], path: Path) -> None:
+    """Write the results so far."""
     path.parent.mkdir(parents=True, exist_ok=True)
     path.write_text(json.dumps(results, indent=1), encoding="utf-8")
 
 
 def publish(results: dict[str, Any], quick: bool) -> None:
-    """Write the page and its plots; those of a quick run stay out of the documentation."""
+    """Write the page and its plots; those of a quick run go to another folder."""
     folder = OUTPUT / "quick" if quick else ROOT / "docs"
     images = folder / "images"
     images.mkdir(parents=True, exist_ok=True)
@@ -54,17 +54,16 @@ def main() -> None:
     if unknown:
         parser.error(f"{', '.join(sorted(unknown))}: not a part; take some of {', '.join(['page', *PARTS])}")
     effort = QUICK if options.quick else FULL
-    kept = OUTPUT / ("quick.json" if options.quick else "results.json")
-    results = json.loads(kept.read_text(encoding="utf-8")) if kept.exists() else {}
-    # Kernels and answers of an earlier run may be those of other code.
+    saved = OUTPUT / ("quick.json" if options.quick else "results.json")
+    results = json.loads(saved.read_text(encoding="utf-8")) if saved.exists() else {}
+    # Kernels and answers of an earlier run may be out of date.
     shutil.rmtree(CACHE, ignore_errors=True)
     if options.parts != ["page"] or not results:
         results |= {"machine": page.machine(), "rounds": effort.rounds}
     for part in options.parts or PARTS:
         if part != "page":
             results[part] = PARTS[part](effort, prefixed(progress, part))
-            keep(results, kept)
-    # The answers of large sheets are large.
+            save(results, saved)
     shutil.rmtree(CACHE, ignore_errors=True)
     publish(results, options.quick)
 

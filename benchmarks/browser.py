@@ -20,6 +20,7 @@ import tempfile
 import time
 from pathlib import Path
 
+from benchmarks.marked import replace_marked
 from benchmarks.process import ROOT
 from taichi_msm import load_scene
 from taichi_msm.view.events import Drag, Press, Release
@@ -30,15 +31,14 @@ from taichi_msm.view.session import Session
 EVENTS = 200
 PARTS = 60
 
-# The client drags this often [s], at random.
+# Limits of the random intervals between drags [s].
 INTERVALS_S = 0.02, 0.12
 
 PAGE = ROOT / "docs" / "view.md"
-START, END = "<!-- browser: made by benchmarks/browser.py -->\n", "<!-- end of browser -->\n"
 
 
 async def drag(url: str) -> None:
-    """Press and drag as a page does; print the times to the pictures [s], and the pictures per second, as JSON."""
+    """Press and drag like the page; print latencies [s] and pictures per second as JSON."""
     from tornado.websocket import websocket_connect
 
     connection = await websocket_connect(url.replace("http", "ws") + "socket")
@@ -78,7 +78,7 @@ async def drag(url: str) -> None:
 
 
 def measure_parts(session: Session) -> dict[str, str]:
-    """Measure the parts of a picture: medians of the elapsed time and of the CPU time of all threads."""
+    """Return the parts of a picture's time: medians of elapsed and CPU time of all threads."""
     times: dict[str, list[tuple[float, float]]] = {"step a frame": [], "draw": [], "encode as JPEG": []}
     session.handle(Press(256, 256))
     for n in range(PARTS):
@@ -100,7 +100,7 @@ def measure_parts(session: Session) -> dict[str, str]:
 
 
 def clocks() -> tuple[float, float]:
-    """Return the time, and the CPU time of all threads [s]."""
+    """Return wall and CPU time of all threads [s]."""
     return time.perf_counter(), time.process_time()
 
 
@@ -127,8 +127,7 @@ def main() -> None:
     }
     table = "| | |\n|---|---:|\n" + "".join(f"| {name} | {value} |\n" for name, value in rows.items())
     page = PAGE.read_text(encoding="utf-8")
-    before, rest = page.split(START)
-    PAGE.write_text(before + START + table + END + rest.split(END)[1], encoding="utf-8")
+    PAGE.write_text(replace_marked(page, "browser", "benchmarks/browser.py", table), encoding="utf-8")
     print(table)
 
 

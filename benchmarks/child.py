@@ -1,8 +1,8 @@
-"""The process of one measurement, which `process.call` starts.
+"""Process of one measurement, started by `process.call`.
 
     python -m benchmarks.child MODULE:FUNCTION ARGUMENTS
 
-calls the function with the arguments, a JSON object, and prints what it returns as JSON on the last line.
+calls the function with the arguments, a JSON object, and prints the returned value as JSON in the last line.
 """
 
 from __future__ import annotations
@@ -16,14 +16,14 @@ from benchmarks.process import UnavailableError
 
 
 def answer(task: str, arguments: dict[str, Any]) -> dict[str, Any]:
-    """Call a function here; gives what it returned, or why it is not available."""
+    """Call a function; return its value, or the reason why it is unavailable."""
     module, function = task.split(":")
     try:
         return {"returned": getattr(importlib.import_module(module), function)(**arguments)}
     except ModuleNotFoundError as error:
         return {"unavailable": f"{error.name} is not installed"}
     except (ImportError, UnavailableError) as error:
-        # What follows in parentheses is a path.
+        # A path follows in parentheses.
         return {"unavailable": str(error).splitlines()[0].split(" (")[0]}
 
 

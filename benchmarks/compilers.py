@@ -1,4 +1,4 @@
-"""This program compiled by Taichi and by Quadrants, in turn: whole runs, steps, pictures, labels."""
+"""Taichi against Quadrants: whole runs, steps, pictures and labels, in turn."""
 
 from __future__ import annotations
 
@@ -20,12 +20,12 @@ PIXELS = (512, 1024)
 
 OURS = "taichi_msm"
 
-# By the work and by the name of the compiler [s].
+# Times by the work and by the name of the compiler [s].
 Samples = dict[str, dict[str, list[float]]]
 
 
 def works(folder: str) -> dict[str, Callable[[str], float]]:
-    """Make what is timed: each takes the name of a compiler and gives seconds.
+    """Return the timed works: functions from the name of a compiler to seconds.
 
     Args:
         folder: for the results of runs and for compiled kernels.
@@ -61,16 +61,16 @@ def works(folder: str) -> dict[str, Callable[[str], float]]:
 
 
 def measure(rounds: int, progress: Progress) -> Samples:
-    """Time every work with each compiler in turn; nothing where only one is installed."""
+    """Time every work with each compiler in turn; nothing if only one is installed."""
     if not all(find_spec(name) for name in COMPILERS):
         return {}
     with tempfile.TemporaryDirectory() as folder:
         timed = works(folder)
-        found: Samples = {work: {name: [] for name in COMPILERS} for work in timed}
+        samples: Samples = {work: {name: [] for name in COMPILERS} for work in timed}
         # The first round compiles.
         for number in range(1 + rounds):
             for work, seconds in timed.items():
                 for name in COMPILERS:
                     progress(f"{work}, {name}: round {number} of {rounds}")
-                    found[work][name].append(seconds(name))
-    return {work: {name: samples[1:] for name, samples in by_name.items()} for work, by_name in found.items()}
+                    samples[work][name].append(seconds(name))
+    return {work: {name: times[1:] for name, times in by_name.items()} for work, by_name in samples.items()}

@@ -1,9 +1,8 @@
-"""SciPy's general integrator DOP853 on the equations of scenes/figure-3.yaml, in NumPy; prints time and error."""
+"""SciPy's general integrator DOP853 on the equations of scenes/figure-3.yaml, in NumPy."""
 
 from __future__ import annotations
 
 import time
-from collections.abc import Iterable
 from itertools import pairwise
 from typing import Any
 
@@ -15,58 +14,35 @@ from benchmarks.process import ROOT
 from taichi_msm import load_scene
 from taichi_msm.model.loads import decay, evaluate_loads
 from taichi_msm.solver.planning import make_plan
-from taichi_msm.terms.elasticity import SpringFamily, spring_families
-from taichi_msm.terms.springs import MIN_SQUARED_LENGTH
+from tests import reference
 
 Array = NDArray[Any]
 
 RTOLS = (1e-3, 1e-5, 1e-7)
 REFERENCE_RTOL = 1e-10
 
-# Loads jump at keyframes: they are evaluated at this distance from them, as a fraction of the interval.
-KEY_MARGIN = 1e-9
-
-
-def elastic_force(families: Iterable[SpringFamily], displacement: Array) -> Array:
-    """Return the sum of the forces of springs on each mass point (eq. 2) [N], shape (rows, cols, 3).
-
-    Args:
-        families: the springs.
-        displacement: x - X [m], shape (rows, cols, 3).
-    """
-    force = np.zeros_like(displacement)
-    for family in families:
-        q, edges, square_difference, square = family.elongation(displacement)
-        square = square + MIN_SQUARED_LENGTH
-        k, tau = family.stiffness, family.tension
-        pull = family.law.pull(k, tau, square_difference, square, family.length, *family.parameters)
-        on_start = pull[..., None] * edges + tau[..., None] * q
-        force[family.start] += on_start
-        force[family.end] -= on_start
-    return force
-
 
 def integrate(rtol: float, largest: float = 0.03) -> Array:
-    """Return the displacements at every frame but the first [m], shape (F, rows, cols, 3).
+    """Return the displacements at every frame but the first [m], shape (frames, rows, cols, 3).
 
     Args:
-        rtol: relative tolerance; the absolute tolerance is rtol x largest / 10.
-        largest: order of the largest displacement [m].
+        rtol: relative tolerance; the absolute one is rtol x largest / 10.
+        largest: rough largest displacement [m].
     """
     plan = make_plan(load_scene(ROOT / "scenes" / "figure-3.yaml", ["output=[]"]))
     scene, shape = plan.scene, (*plan.scene.sheet.points, 3)
-    families, free = tuple(spring_families(plan)), ~plan.fixed[..., None]
+    assembled, free = reference.sheet(scene), ~plan.fixed[..., None]
     share = decay(scene.probes[0], scene.sheet)[..., None]
     frames = np.arange(1, plan.grid.frames + 1) / plan.grid.frames_per_second
     state, displacements = np.zeros((2, *shape)).ravel(), []
     # Intervals between keyframes, where loads are smooth.
     for start, end in pairwise(sorted({0.0, *(t for t, _ in scene.probes[0].load), float(frames[-1])})):
-        margin = KEY_MARGIN * (end - start)
+        margin = 1e-9 * (end - start)  # loads jump at keyframes
 
         def motion(t: float, y: Array, first: float = start + margin, last: float = end - margin) -> Array:
             u, v = y.reshape(2, *shape)
             loads = evaluate_loads(plan, np.clip([t], first, last))
-            force = elastic_force(families, u) - loads.active[0] * plan.material.virtual * u
+            force = reference.elastic_force(scene, u, assembled) - loads.active[0] * plan.material.virtual * u
             force += share * loads.strength[0, 0]
             acceleration = (force - scene.damping * v) / scene.sheet.mass
             return np.stack([v, acceleration * free]).ravel()
@@ -90,8 +66,3 @@ def measure() -> dict[float, tuple[float, float]]:
         seconds = time.perf_counter() - start
         results[rtol] = seconds, float(np.linalg.norm(frames - exact, axis=-1).max() / largest)
     return results
-
-
-if __name__ == "__main__":
-    for rtol, (seconds, error) in measure().items():
-        print(f"rtol {rtol:g}: {seconds:.3g} s, error {error:.2g}")

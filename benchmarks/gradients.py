@@ -1,17 +1,16 @@
-"""What a gradient costs beside a forward run, and beside Taichi's own automatic differentiation of the same steps.
+"""Time of a gradient, against a forward run and against Taichi's automatic differentiation of the same steps.
 
-The loss is half the sum of the squares of the last displacements; asked for is its derivative by the factor of the
-stiffness of every cell. All in f64.
+The loss is half the sum of squares of the last displacements; the parameters are the stiffness factors of all cells.
+All in f64.
 """
 
 from __future__ import annotations
 
-import time
-from collections.abc import Callable
 from typing import Any
 
 import numpy as np
 
+from benchmarks.clock import in_turn
 from benchmarks.process import FailedError, call
 from benchmarks.race import Progress
 from benchmarks.stepping.problem import Problem
@@ -22,17 +21,17 @@ from taichi_msm.solver.planning import make_plan, with_time
 from taichi_msm.system import runtime
 from taichi_msm.system.process import available_threads
 
-# Points along a side, and steps; Taichi keeps every one of them, and its derivative.
+# Points along a side, and steps; Taichi stores every step and its derivative.
 SIZES = {61: 1000, 331: 100}
 
 OURS, AUTODIFF = "taichi_msm", "Taichi autodiff"
 
-# Largest difference of derivatives, relative to the largest derivative.
+# Largest difference, relative to the largest derivative.
 TOLERANCE = 1e-9
 
 
 def plan_of(points: int, steps: int) -> Plan:
-    """Plan so many steps as a single frame."""
+    """Return a plan with one frame of `steps` steps."""
     problem = Problem(points)
     duration = steps * problem.grid.step
     times = {"duration": duration, "frames_per_second": 1 / duration, "step": problem.grid.step, "precision": "f64"}
@@ -40,12 +39,12 @@ def plan_of(points: int, steps: int) -> Plan:
 
 
 def ours(points: int, steps: int, rounds: int) -> dict[str, Any]:
-    """Time a forward run and a gradient of this program [s], and give the derivatives."""
+    """Time a forward run and a gradient of this program [s]; return the times and the gradient."""
     device = runtime.start("cpu", available_threads())
     plan = plan_of(points, steps)
     forward, adjoint = Dynamics(plan, device), Adjoint(plan, device)
     rest = np.zeros((2, points, points, 3))
-    found = rest[0, 1:, 1:, 0]
+    gradient = rest[0, 1:, 1:, 0]
 
     def run() -> None:
         forward.restart(plan)
@@ -53,46 +52,35 @@ def ours(points: int, steps: int, rounds: int) -> dict[str, Any]:
         forward.displacement()
 
     def differentiate() -> None:
-        nonlocal found
-        position, slope = adjoint.run(), np.zeros_like(rest)
-        slope[-1] = position[-1] - position[0]
-        found = adjoint.backward(slope).maps["springs.map"]
+        nonlocal gradient
+        position, cotangent = adjoint.run(), np.zeros_like(rest)
+        cotangent[-1] = position[-1] - position[0]
+        gradient = adjoint.backward(cotangent).maps["springs.map"]
 
-    return _timed(run, differentiate, rounds) | {"slope": found.tolist()}
+    times = in_turn({"forward": run, "gradient": differentiate}, rounds)
+    return {**times, "gradient_values": gradient.tolist()}
 
 
 def autodiff(points: int, steps: int, rounds: int) -> dict[str, Any]:
-    """Time the same of Taichi [s]."""
+    """Time the same with Taichi's automatic differentiation [s]."""
     from benchmarks.taichi_autodiff import Differentiated
 
     peer = Differentiated(Problem(points), steps, available_threads())
-    times = _timed(peer.run, peer.differentiate, rounds)
-    return times | {"slope": peer.slope().tolist()}
-
-
-def _timed(run: Callable[[], object], differentiate: Callable[[], object], rounds: int) -> dict[str, Any]:
-    """Time two pieces of work in turn, after both have been compiled."""
-    samples: dict[str, Any] = {"forward": [], "gradient": []}
-    for number in range(rounds + 1):
-        for name, work in (("forward", run), ("gradient", differentiate)):
-            start = time.perf_counter()
-            work()
-            if number:
-                samples[name].append(time.perf_counter() - start)
-    return samples
+    times = in_turn({"forward": peer.run, "gradient": peer.differentiate}, rounds)
+    return {**times, "gradient_values": peer.gradient().tolist()}
 
 
 def measure(rounds: int, progress: Progress) -> dict[str, dict[str, dict[str, list[float]]]]:
-    """Time both for every size; FailedError: their derivatives differ."""
-    found: dict[str, dict[str, dict[str, list[float]]]] = {}
+    """Time both for every size; a FailedError means that their gradients differ."""
+    results: dict[str, dict[str, dict[str, list[float]]]] = {}
     for points, steps in SIZES.items():
-        own, slopes = {}, []
+        peers, gradients = {}, []
         for name, task in ((OURS, "ours"), (AUTODIFF, "autodiff")):
             progress(f"{points} x {points}, {name}")
             answer = call(f"benchmarks.gradients:{task}", points=points, steps=steps, rounds=rounds)
-            slopes.append(np.array(answer.pop("slope")))
-            own[name] = answer
-        if not np.abs(slopes[0] - slopes[1]).max() <= TOLERANCE * np.abs(slopes[0]).max():
-            raise FailedError(f"{points} x {points}: the derivatives differ")
-        found[f"{points} × {points}, {steps} steps"] = own
-    return found
+            gradients.append(np.array(answer.pop("gradient_values")))
+            peers[name] = answer
+        if not np.abs(gradients[0] - gradients[1]).max() <= TOLERANCE * np.abs(gradients[0]).max():
+            raise FailedError(f"{points} x {points}: the gradients differ")
+        results[f"{points} × {points}, {steps} steps"] = peers
+    return results

@@ -1,23 +1,20 @@
-"""What it takes to launch a kernel that does the residual is next to 0, on every thread."""
+"""Time of launching a kernel that does almost nothing, on every thread."""
 
 from __future__ import annotations
 
 from benchmarks.clock import seconds
 from taichi_msm.system import runtime
 
-# Iterations of a parallel loop, enough for every thread of a common machine to get some.
-ITERATIONS = 1 << 16
-
 
 def empty() -> float:
-    """Time a launch [s]."""
+    """Return the time of a launch [s]."""
     runtime.start("cpu")
     ti = runtime.ti
     total = ti.field(ti.i32, shape=())
 
     @ti.kernel
     def nothing():
-        for i in range(ITERATIONS):
+        for i in range(1 << 16):  # enough iterations for every thread
             if i < 0:
                 total[None] += 1
 

@@ -1,17 +1,13 @@
-"""What a picture costs with every shading, an instrument, labels, and through a lens; all in turn in one process.
-
-And how many frames a second a run writes with labels, from the first step to the last file.
-"""
+"""Time of a picture by shading, instrument, labels and lens, in turn in one process; frame rate of runs with labels."""
 
 from __future__ import annotations
 
 import json
 import tempfile
-import time
 from collections.abc import Callable
 from typing import Any
 
-from benchmarks.clock import seconds
+from benchmarks.clock import in_turn, seconds
 from benchmarks.drawing.problem import Problem
 from benchmarks.process import call
 from benchmarks.race import Progress
@@ -32,22 +28,22 @@ ALL_LABELS = tuple(name for name, output in outputs.OUTPUTS.items() if output.so
 PIXELS = (512, 1024)
 REFINE = 10
 
-# What others are compared with.
+# The baseline.
 HEADLIGHT = "headlight"
 
 INSTRUMENTED = "tissue, instrument"
 LABELS = "labels alone"
 
-# Pinholes without and with a lens, at a height [m] from which either picture shows nothing but the sheet.
+# Pinholes without and with a lens, at a height [m] from which the sheet fills either picture.
 PINHOLES: dict[str, dict[str, Any]] = {"pinhole": {}, "lens": {"distortion": {"k1": -0.3}}}
 HEIGHT = 0.22
 
-# Pictures of every kind in a round.
+# Pictures of every variant in a round.
 PICTURES = 8
 
 INSTRUMENT = {"radius": 0.012, "shaft": [0.5, -0.6, 0.9], "length": 0.3}
 
-# What is written of a run, and the scene's keys for it; its own steps are of no interest here.
+# Outputs of the timed runs, and their settings.
 OUTPUTS = {
     "frames": ("png",),
     "labels": ALL_LABELS,
@@ -59,7 +55,7 @@ Samples = dict[str, list[float]]
 
 
 def variants(problem: Problem) -> dict[str, Callable[[], Any]]:
-    """Make what is timed, each a call."""
+    """Return the timed calls."""
     position, camera = problem.position, view(problem.scene)
 
     def scene(shading: str, **changes: Any) -> Scene:
@@ -74,46 +70,37 @@ def variants(problem: Problem) -> dict[str, Callable[[], Any]]:
     def pinhole(lens: dict[str, Any]) -> Scene:
         focal, middle = 1.2 * problem.pixels, (problem.pixels - 1) / 2
         intrinsics = {"fx": focal, "fy": focal, "cx": middle, "cy": middle}
-        return held(scene("tissue", camera=Camera(eye=(0, 0, HEIGHT), intrinsics=intrinsics, **lens)))
+        return with_instrument(scene("tissue", camera=Camera(eye=(0, 0, HEIGHT), intrinsics=intrinsics, **lens)))
 
-    def held(made: Scene) -> Scene:
+    def with_instrument(made: Scene) -> Scene:
         probe = made.probes[0].model_copy(update={"instrument": INSTRUMENT})
         return made.model_copy(update={"probes": [probe]})
 
     plain, tissue = scene(HEADLIGHT), scene("tissue")
     pinholes = {name: pinhole(lens) for name, lens in PINHOLES.items()}
-    seen = picture(plain, picture=False, labels=True)().labels.coordinates
+    coordinates = picture(plain, picture=False, labels=True)().labels.coordinates
     return {
         HEADLIGHT: picture(plain),
         "none": picture(scene("none")),
         "tissue": picture(tissue),
         "tissue, relief": picture(scene("tissue", light={"relief": -0.2})),
-        INSTRUMENTED: picture(held(tissue)),
+        INSTRUMENTED: picture(with_instrument(tissue)),
         "headlight and labels": picture(plain, labels=True),
         LABELS: picture(plain, picture=False, labels=True),
-        "flow and occlusion": lambda: compute_flow(plain, seen, problem.rest, camera),
+        "flow and occlusion": lambda: compute_flow(plain, coordinates, problem.rest, camera),
         **{f"{INSTRUMENTED}, {name}": picture(made) for name, made in pinholes.items()},
         **{f"{LABELS}, {name}": picture(made, picture=False, labels=True) for name, made in pinholes.items()},
     }
 
 
 def cost(pixels: int, rounds: int) -> Samples:
-    """Time every variant [s], in turn."""
+    """Return times of every variant [s], measured in turn."""
     runtime.start("cpu", available_threads())
-    timed = variants(Problem(pixels, REFINE, lit=True))
-    samples: Samples = {name: [] for name in timed}
-    for _ in range(1 + rounds):
-        for name, draw in timed.items():
-            start = time.perf_counter()
-            for _ in range(PICTURES):
-                draw()
-            samples[name].append((time.perf_counter() - start) / PICTURES)
-    # In the first round kernels are compiled.
-    return {name: times[1:] for name, times in samples.items()}
+    return in_turn(variants(Problem(pixels, REFINE, lit=True)), rounds, PICTURES)
 
 
 def labels(pixels: int) -> float:
-    """Time the labels of a picture without its colours [s]."""
+    """Return the time of the labels of a picture without its colours [s]."""
     runtime.start("cpu", available_threads())
     draw = variants(Problem(pixels, REFINE, lit=True))[LABELS]
     draw()
@@ -121,8 +108,8 @@ def labels(pixels: int) -> float:
 
 
 def rates(rounds: int) -> Samples:
-    """Tell how many frames a second runs write, after compilation."""
-    found: Samples = {name: [] for name in OUTPUTS}
+    """Return frames per second of runs, after compilation, from the first step to the last file."""
+    samples: Samples = {name: [] for name in OUTPUTS}
     settings = [word for setting in SETTINGS for word in ("--set", setting)]
     with tempfile.TemporaryDirectory() as folder:
         for _ in range(rounds):
@@ -131,8 +118,8 @@ def rates(rounds: int) -> Samples:
                 _, text = command("run", SCENE, "--json", "--out", f"{folder}/out", *words, cache=f"{folder}/cache")
                 record = json.loads(text)
                 times = record["timings"]
-                found[name].append(record["frames"] / (times["total"] - times["startup"] - times["compile"]))
-    return found
+                samples[name].append(record["frames"] / (times["total"] - times["startup"] - times["compile"]))
+    return samples
 
 
 def measure(rounds: int, progress: Progress) -> dict[str, Any]:

@@ -1,4 +1,4 @@
-"""Builds the C++ files with what an expert would tell the compiler."""
+"""Compilation of the C++ files with an expert's options."""
 
 from __future__ import annotations
 
@@ -9,27 +9,27 @@ from pathlib import Path
 
 from benchmarks.process import AVX2, CACHE, UnavailableError, vector_bits
 
-# In the order of preference: for 1 / sqrt(x) with AVX-512 g++ 12 takes one estimate for the root and another one for
-# its reciprocal, and a step is half as long again.
+# By preference: for 1 / sqrt(x) with AVX-512 g++ 12 has two estimates, of the root and of its reciprocal, and a step
+# takes half as long again.
 COMPILERS = ("clang++", "g++")
 
 
 def compiler() -> str:
-    """Name the compiler that is taken; "" if there is none."""
+    """Return the name of the compiler, empty if there is none."""
     return next((name for name in COMPILERS if shutil.which(name)), "")
 
 
 def options() -> list[str]:
-    """Give the compiler's options."""
+    """Return the compiler's options."""
     wide = ["-march=native", "-mprefer-vector-width=512"] if vector_bits() > 256 else [f"-march={AVX2}"]
     return ["-O3", *wide, "-ffast-math", "-fopenmp"]
 
 
 def library(source: Path) -> ctypes.CDLL:
-    """Compile a C++ file, once in a run of the benchmarks, and load it.
+    """Compile a C++ file, once per run of the benchmarks, and load it.
 
     Raises:
-        UnavailableError: when there is no compiler, or it fails.
+        UnavailableError: without a compiler, or when it fails.
     """
     built = CACHE / f"{source.stem}-{vector_bits()}.so"
     if not compiler():

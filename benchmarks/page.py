@@ -1,4 +1,4 @@
-"""docs/performance.md from what was measured."""
+"""docs/performance.md from the results."""
 
 from __future__ import annotations
 
@@ -10,13 +10,14 @@ from typing import Any
 
 from benchmarks import bounds, gradients, looks, native, terms, whole_run
 from benchmarks.drawing.measure import WANTED
-from benchmarks.parts import NARROW, PIXELS, READY, REFINE
+from benchmarks.marked import table
+from benchmarks.parts import NARROW, READY, REFINE
 from benchmarks.process import ROOT
 from benchmarks.stepping.measure import TOLERANCE
 from taichi_msm import load_scene
 from taichi_msm.solver.planning import make_plan
 from taichi_msm.study import study
-from taichi_msm.study.format import format_duration, format_number, format_timing, markdown_table
+from taichi_msm.study.format import format_duration, format_number, format_timing
 from taichi_msm.study.result import Timing
 from taichi_msm.system.compiler import COMPILERS, active_compiler
 from taichi_msm.system.process import available_threads
@@ -25,7 +26,7 @@ from taichi_msm.system.runtime import Device, vector_bits
 TEMPLATE = ROOT / "docs" / "performance.template"
 NOT_MEASURED = "(not measured yet)"
 
-# Whose versions the page names, where they are installed.
+# Packages whose versions the page names.
 PACKAGES = ("numba", "jax", "opencv-python-headless", "moderngl", "vtk", "scikit-image")
 
 Results = dict[str, Any]
@@ -33,9 +34,9 @@ Entry = dict[str, Any]
 
 
 def machine() -> Results:
-    """Describe where the benchmarks run."""
-    found = study.machine_record(Device("cpu", available_threads()))
-    versions = {active_compiler().title: active_compiler().version, "NumPy": found["versions"]["numpy"]}
+    """Describe the machine."""
+    record = study.machine_record(Device("cpu", available_threads()))
+    versions = {active_compiler().title: active_compiler().version, "NumPy": record["versions"]["numpy"]}
     for package in PACKAGES:
         try:
             versions[package] = metadata.version(package)
@@ -45,18 +46,18 @@ def machine() -> Results:
         command = [compiler, "-dumpfullversion", "-dumpversion"]
         versions[compiler] = subprocess.run(command, capture_output=True, text=True).stdout.strip()
     return {
-        "cpu": found["cpu"],
-        "threads": found["threads"],
+        "cpu": record["cpu"],
+        "threads": record["threads"],
         "vectors": vector_bits(),
         "compiler": " ".join([native.compiler(), *native.options()]),
         "caches": _caches(),
-        "python": found["versions"]["python"],
+        "python": record["versions"]["python"],
         "versions": ", ".join(f"{name} {version}" for name, version in versions.items()),
     }
 
 
 def _caches() -> str:
-    """Name the caches of data that the first core sees."""
+    """Describe the data caches of the first core."""
     caches = []
     for folder in sorted(Path("/sys/devices/system/cpu/cpu0/cache").glob("index*")):
         level, kind, size = ((folder / name).read_text().strip() for name in ("level", "type", "size"))
@@ -66,7 +67,7 @@ def _caches() -> str:
 
 
 def tables(results: Results) -> dict[str, str]:
-    """Make every table of the page that was measured."""
+    """Return the tables of the page; those of missing parts are `NOT_MEASURED`."""
     makers: dict[str, tuple[str, Callable[[], str]]] = {
         "stepping_table": ("stepping", lambda: stepping_table(results["stepping"])),
         "ratio_table": ("stepping", lambda: ratio_table(results["stepping"])),
@@ -88,15 +89,15 @@ def tables(results: Results) -> dict[str, str]:
         "step_bound_table": ("bounds", lambda: step_bound_table(results)),
         "drawing_bound_table": ("bounds", lambda: drawing_bound_table(results)),
     }
-    made = {name: make() if part in results else NOT_MEASURED for name, (part, make) in makers.items()}
-    where = f"{results['machine']['cpu']}, {results['machine']['vectors']} bits"
+    texts = {name: make() if part in results else NOT_MEASURED for name, (part, make) in makers.items()}
+    wide = f"{results['machine']['cpu']}, {results['machine']['vectors']} bits"
     narrow = f"{results['machine']['cpu']}, {NARROW} bits"
-    return {name: _on(narrow if name.startswith("narrow") else where, text) for name, text in made.items()}
+    return {name: _on(narrow if name.startswith("narrow") else wide, text) for name, text in texts.items()}
 
 
-def _on(where: str, text: str) -> str:
-    """Name the processor and the width of its vectors in the head of a table."""
-    return text.replace("| ", f"| {where}: ", 1) if text.startswith("| ") else text
+def _on(processor: str, text: str) -> str:
+    """Add the processor and the width of its vectors to the head of a table."""
+    return text.replace("| ", f"| {processor}: ", 1) if text.startswith("| ") else text
 
 
 def page(results: Results) -> str:
@@ -109,7 +110,6 @@ def page(results: Results) -> str:
         lit_wanted=f"{WANTED[True]:g}",
         flat_wanted=f"{WANTED[False]:g}",
         refine=REFINE,
-        pixels=PIXELS,
         step_bytes=bounds.STEP_BYTES,
         step_flops=f"{bounds.STEP_FLOPS:g}",
         step_roots=bounds.STEP_ROOTS,
@@ -121,7 +121,7 @@ def page(results: Results) -> str:
 
 
 def warm_shares(results: Results) -> str:
-    """Say which share of a warm run each stage has."""
+    """Format the share of each stage in a warm run."""
     if "whole_run" not in results:
         return NOT_MEASURED
     warm = {stage: Timing.of(times).median for stage, times in results["whole_run"]["warm"].items()}
@@ -130,20 +130,15 @@ def warm_shares(results: Results) -> str:
 
 
 def launch_share(results: Results) -> str:
-    """Say what a launch adds to a step when it takes a whole frame."""
-    found = results.get("bounds", {})
-    if "one_step" not in found:
+    """Format the launch time per step of a frame."""
+    rates = results.get("bounds", {})
+    if "one_step" not in rates:
         return NOT_MEASURED
-    return format_duration(found["one_step"] / make_plan(load_scene(ROOT / whole_run.SCENE)).grid.steps_per_frame)
-
-
-def table(head: list[str], rows: list[list[str]]) -> str:
-    """Write a table, its first column of text and the others of numbers."""
-    return markdown_table(head, rows, left_columns=(0,))
+    return format_duration(rates["one_step"] / make_plan(load_scene(ROOT / whole_run.SCENE)).grid.steps_per_frame)
 
 
 def stepping_table(measured: dict[str, list[Entry]]) -> str:
-    """Show the time of a step of every peer."""
+    """Table of the time of a step of every peer."""
     first = next(iter(measured.values()))
     rows = []
     for index, entry in enumerate(first):
@@ -155,7 +150,7 @@ def stepping_table(measured: dict[str, list[Entry]]) -> str:
 
 
 def ratio_table(measured: dict[str, list[Entry]]) -> str:
-    """Show how many times as long as this program the peers take."""
+    """Table of the times of peers over that of this program."""
     return table(
         ["time / this program's", *(f"{n} × {n}" for n in measured)],
         [
@@ -166,28 +161,28 @@ def ratio_table(measured: dict[str, list[Entry]]) -> str:
     )
 
 
-def narrow_step_table(found: Results) -> str:
-    """Show the time of a step with narrower vectors than the processor has."""
-    if not found:
+def narrow_step_table(narrow: Results) -> str:
+    """Table of the time of a step with vectors of 256 bits."""
+    if not narrow:
         return f"(this processor has none wider than {NARROW} bits: the tables above are of these)"
-    return size_table(found["stepping"])
+    return size_table(narrow["stepping"])
 
 
-def narrow_picture_table(found: Results) -> str:
-    """Show the time of a picture with narrower vectors than the processor has."""
-    if not found:
+def narrow_picture_table(narrow: Results) -> str:
+    """Table of the time of a picture with vectors of 256 bits."""
+    if not narrow:
         return ""
     rows = [
         [f"{name}, {kind}", *(_cell(entries[index]) for entries in by_pixels.values())]
-        for kind, by_pixels in found["drawing"].items()
+        for kind, by_pixels in narrow["drawing"].items()
         for index, name in enumerate(entry["name"] for entry in next(iter(by_pixels.values())))
     ]
-    head = table(["time of a picture", *(f"{n} × {n}" for n in found["drawing"]["lit"])], rows)
-    return f"{head}\n\nOur lit picture takes {remap_ratios(found['drawing'])} times as long as `{READY}`."
+    head = table(["time of a picture", *(f"{n} × {n}" for n in narrow["drawing"]["lit"])], rows)
+    return f"{head}\n\nOur lit picture takes {remap_ratios(narrow['drawing'])} times as long as `{READY}`."
 
 
 def remap_ratios(measured: dict[str, dict[str, list[Entry]]]) -> str:
-    """Say how many times as long as cv2.remap with ready maps a lit picture takes, for every size."""
+    """Format the times of a lit picture over cv2.remap with ready maps, for every size."""
     ratios = []
     for pixels, lit in measured["lit"].items():
         ready = next(entry for entry in measured["flat"][pixels] if entry["name"] == READY)
@@ -196,24 +191,23 @@ def remap_ratios(measured: dict[str, dict[str, list[Entry]]]) -> str:
 
 
 def drawing_table(measured: dict[str, list[Entry]]) -> str:
-    """Show the time of a picture of every peer."""
+    """Table of the time of a picture of every peer."""
     first = next(iter(measured.values()))
     rows = []
     for index, entry in enumerate(first):
-        near = entry["answer"]
-        agrees = "-" if near is None else f"{near:.1f} dB"
+        agreement = "-" if entry["answer"] is None else f"{entry['answer']:.1f} dB"
         cells = [
             cell
             for entries in measured.values()
             for cell in (_cell(entries[index]), _ratio(entries[index], entries[0]))
         ]
-        rows.append([entry["name"], *cells, agrees, _compile(entry)])
+        rows.append([entry["name"], *cells, agreement, _compile(entry)])
     head = [word for n in measured for word in (f"{n} × {n}", "/ ours")]
     return table(["time of a picture", *head, "PSNR", "compile"], rows)
 
 
 def whole_run_table(measured: dict[str, dict[str, list[float]]]) -> str:
-    """Show the time of every stage of a run, and of a check."""
+    """Table of the time of every stage of a run, and of a check."""
     stages = list(measured["cold"])
     rows = [
         [kind, *(_seconds(times[stage]) if stage in times else "-" for stage in stages)]
@@ -223,7 +217,7 @@ def whole_run_table(measured: dict[str, dict[str, list[float]]]) -> str:
 
 
 def compilers_table(measured: dict[str, dict[str, list[float]]]) -> str:
-    """Show the time of everything with each compiler, and how many times the first one's the other takes."""
+    """Table of the times with each compiler, and of their ratios."""
     if not measured:
         return "(not measured: needs both compilers)"
     names = list(COMPILERS)
@@ -235,43 +229,47 @@ def compilers_table(measured: dict[str, dict[str, list[float]]]) -> str:
 
 
 def relative_table(head: str, measured: dict[str, dict[str, list[float]]], base: str) -> str:
-    """Show times at every size, and how many times that of one of them each is."""
-    medians = {size: {name: Timing.of(times).median for name, times in own.items()} for size, own in measured.items()}
+    """Table of times at every size, and of their ratios to a base."""
+    medians = {
+        size: {name: Timing.of(times).median for name, times in variants.items()} for size, variants in measured.items()
+    }
     rows = [
-        [name, *(f"{format_duration(own[name])} ({own[name] / own[base]:.2f})" for own in medians.values())]
+        [name, *(f"{format_duration(times[name])} ({times[name] / times[base]:.2f})" for times in medians.values())]
         for name in next(iter(medians.values()))
     ]
     return table([head, *medians], rows)
 
 
 def gradient_table(measured: dict[str, dict[str, dict[str, list[float]]]]) -> str:
-    """Show the time of a forward run and of a gradient, and how many times that of this program's run it is."""
+    """Table of the times of forward runs and gradients, and of their ratios to this program's run."""
     rows = []
     for size, peers in measured.items():
         run = Timing.of(peers[gradients.OURS]["forward"]).median
         for name, samples in peers.items():
-            forward, whole = (Timing.of(samples[kind]) for kind in ("forward", "gradient"))
-            rows.append([f"{size}, {name}", format_timing(forward), format_timing(whole), f"{whole.median / run:.1f}"])
+            forward, gradient = (Timing.of(samples[kind]) for kind in ("forward", "gradient"))
+            rows.append(
+                [f"{size}, {name}", format_timing(forward), format_timing(gradient), f"{gradient.median / run:.1f}"]
+            )
     return table(["a gradient", "forward run", "value and gradient", "in forward runs of taichi_msm"], rows)
 
 
 def pictures(results: Results) -> dict[str, dict[str, list[float]]]:
     """Return the times of all kinds of pictures, by their size."""
-    return {f"{size} × {size}": own for size, own in results["looks"]["pictures"].items()}
+    return {f"{size} × {size}": times for size, times in results["looks"]["pictures"].items()}
 
 
 def lens_ratios(measured: dict[str, dict[str, list[float]]]) -> str:
-    """Say how many times as long pictures and labels take through a lens."""
+    """Format the range of ratios of times with and without a lens, of pictures and labels."""
     ratios = [
-        Timing.of(own[f"{kind}, lens"]).median / Timing.of(own[f"{kind}, pinhole"]).median
-        for own in measured.values()
+        Timing.of(times[f"{kind}, lens"]).median / Timing.of(times[f"{kind}, pinhole"]).median
+        for times in measured.values()
         for kind in (looks.INSTRUMENTED, looks.LABELS)
     ]
     return f"{min(ratios):.2f} to {max(ratios):.2f}"
 
 
 def rates_table(measured: dict[str, list[float]]) -> str:
-    """Show how many frames a second runs write."""
+    """Table of the frames per second of runs."""
     return table(
         ["512 × 512 pixels", "frames a second"],
         [[name, f"{Timing.of(rates).median:.0f}"] for name, rates in measured.items()],
@@ -279,13 +277,13 @@ def rates_table(measured: dict[str, list[float]]) -> str:
 
 
 def size_table(measured: dict[str, list[Entry]]) -> str:
-    """Show the time of a step of the fastest peers at every size."""
+    """Table of the time of a step of the fastest peers at every size."""
     names = [entry["name"] for entry in next(iter(measured.values()))]
     return table(["points", *names], [[f"{n} × {n}", *map(_cell, entries)] for n, entries in measured.items()])
 
 
 def threads_table(measured: dict[str, dict[str, list[Entry]]]) -> str:
-    """Show the time of a step and of a picture with every number of threads."""
+    """Table of the times of steps and pictures with every number of threads."""
     rows = []
     for work, by_count in measured.items():
         for index, entry in enumerate(next(iter(by_count.values()))):
@@ -294,54 +292,54 @@ def threads_table(measured: dict[str, dict[str, list[Entry]]]) -> str:
     return table(["work", *(f"{count} threads" if count != "1" else "1 thread" for count in counts)], rows)
 
 
-def machine_table(found: Results) -> str:
-    """Show what the machine can do."""
-    if found["said"]:
-        return f"(not measured: {found['said']})"
+def machine_table(rates: Results) -> str:
+    """Table of the machine's rates."""
+    if rates["failure"]:
+        return f"(not measured: {rates['failure']})"
     rows = [
-        ["multiplications with addition", f"{found['flops'] / 1e9:.0f} Gflop/s"],
-        ["reciprocal square roots", f"{found['roots'] / 1e9:.2g} G/s"],
+        ["multiplications with addition", f"{rates['flops'] / 1e9:.0f} Gflop/s"],
+        ["reciprocal square roots", f"{rates['roots'] / 1e9:.2g} G/s"],
     ]
-    for points, bandwidth in found["bandwidth"].items():
+    for points, bandwidth in rates["bandwidth"].items():
         rows.append([f"triad over the state of {points} × {points} points", f"{bandwidth / 1e9:.0f} GB/s"])
-    rows.append(["launch of an empty kernel", format_duration(found["launch"])])
-    rows.append([f"`advance(1)` of {bounds.SMALLEST} × {bounds.SMALLEST} points", format_duration(found["one_step"])])
-    return table(["what", "measured"], rows)
+    rows.append(["launch of an empty kernel", format_duration(rates["launch"])])
+    rows.append([f"`advance(1)` of {bounds.SMALLEST} × {bounds.SMALLEST} points", format_duration(rates["one_step"])])
+    return table(["quantity", "measured"], rows)
 
 
 def step_bound_table(results: Results) -> str:
-    """Show how far a step is from what the machine allows, at every size."""
-    found = results["bounds"]
-    if found["said"] or "size" not in results:
+    """Table of the time of a step against its lower bounds, at every size."""
+    rates = results["bounds"]
+    if rates["failure"] or "size" not in results:
         return NOT_MEASURED
     rows = []
     for points, entries in results["size"].items():
-        if points not in found["bandwidth"] or not entries[0]["samples"]:
+        if points not in rates["bandwidth"] or not entries[0]["samples"]:
             continue
         count = int(points) ** 2
         least = {
-            "bytes": bounds.STEP_BYTES * count / found["bandwidth"][points],
-            "flops": bounds.STEP_FLOPS * count / found["flops"],
-            "roots": bounds.STEP_ROOTS * count / found["roots"],
+            "bytes": bounds.STEP_BYTES * count / rates["bandwidth"][points],
+            "flops": bounds.STEP_FLOPS * count / rates["flops"],
+            "roots": bounds.STEP_ROOTS * count / rates["roots"],
         }
         rows.append([f"{points} × {points}", *_against(Timing.of(entries[0]["samples"]).median, least)])
     return table(["points", "step", "bytes", "flops", "roots", "bound by", "of the bound"], rows)
 
 
 def drawing_bound_table(results: Results) -> str:
-    """Show how far a picture is from what the machine allows, at every size."""
-    found = results["bounds"]
-    if found["said"] or "drawing" not in results:
+    """Table of the time of a picture against its lower bounds, at every size."""
+    rates = results["bounds"]
+    if rates["failure"] or "drawing" not in results:
         return NOT_MEASURED
-    # The slowest of the bandwidths: of a sheet that no cache holds.
-    bandwidth = min(found["bandwidth"].values())
+    # The lowest bandwidth: that of memory.
+    bandwidth = min(rates["bandwidth"].values())
     rows = []
     for pixels, entries in results["drawing"]["lit"].items():
         count = int(pixels) ** 2
         least = {
             "bytes": bounds.COLOUR_BYTES * 2 * count / bandwidth,
-            "flops": bounds.PIXEL_FLOPS * count / found["flops"],
-            "launch": found["launch"],
+            "flops": bounds.PIXEL_FLOPS * count / rates["flops"],
+            "launch": rates["launch"],
         }
         if entries[0]["samples"]:
             rows.append([f"{pixels} × {pixels}", *_against(Timing.of(entries[0]["samples"]).median, least)])
@@ -349,14 +347,14 @@ def drawing_bound_table(results: Results) -> str:
 
 
 def _against(seconds: float, least: dict[str, float]) -> list[str]:
-    """Compare a time with the least times of each kind: the greatest of them is the bound."""
+    """Return cells of a time against lower bounds, the greatest of which counts."""
     binding = max(least, key=lambda kind: least[kind])
     times = map(format_duration, (seconds, *least.values()))
     return [*times, binding, f"{100 * least[binding] / seconds:.0f} %"]
 
 
 def _cell(entry: Entry) -> str:
-    return format_timing(Timing.of(entry["samples"])) if entry["samples"] else str(entry["said"])
+    return format_timing(Timing.of(entry["samples"])) if entry["samples"] else str(entry["failure"])
 
 
 def _ratio(entry: Entry, ours: Entry) -> str:
@@ -370,5 +368,5 @@ def _compile(entry: Entry) -> str:
 
 
 def _seconds(samples: list[float]) -> str:
-    known = Timing.of(samples)
-    return f"{known.median:.2f} ({known.fastest:.2f} to {known.slowest:.2f})"
+    timing = Timing.of(samples)
+    return f"{timing.median:.2f} ({timing.fastest:.2f} to {timing.slowest:.2f})"

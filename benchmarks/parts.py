@@ -1,4 +1,4 @@
-"""The parts of the benchmarks and how much of each is measured."""
+"""The parts of the benchmarks, and their effort."""
 
 from __future__ import annotations
 
@@ -15,36 +15,27 @@ from taichi_msm.system.runtime import vector_bits
 
 STEPPING, DRAWING = "benchmarks.stepping.measure", "benchmarks.drawing.measure"
 
-# The width of the vectors of AVX2.
+# Width of the vectors of AVX2 [bits].
 NARROW = 256
 
-# This program, and the least that a picture costs anyone.
+# This program, and the fastest possible picture.
 OURS, READY = "taichi_msm", "cv2.remap, maps ready"
 
-# The picture of the drawing's scaling, and the sheets whose steps are timed with every number of threads.
+# The picture, and the sheets for every number of threads.
 PIXELS, REFINE = 512, 10
 THREADS_POINTS = (331, 1024)
 
 
 @dataclass(frozen=True)
 class Effort:
-    """How much is measured.
-
-    Attributes:
-        rounds: how often each is timed.
-        points: sizes of the sheet that all peers step.
-        sizes: sizes of the sheet that the fastest ones step.
-        pixels: sizes of the picture that all peers draw.
-        refines: refinements ...
-        resolutions: ... and sizes of the picture that this program draws.
-    """
+    """Effort of a measurement: sizes and rounds."""
 
     rounds: int
-    points: tuple[int, ...]
-    sizes: tuple[int, ...]
-    pixels: tuple[int, ...]
-    refines: tuple[int, ...]
-    resolutions: tuple[int, ...]
+    points: tuple[int, ...]  # sizes of the sheet for all steppers
+    sizes: tuple[int, ...]  # sizes of the sheet for the fastest steppers
+    pixels: tuple[int, ...]  # sizes of the picture for all drawing peers
+    refines: tuple[int, ...]  # refinements for this program
+    resolutions: tuple[int, ...]  # sizes of the picture for this program
 
 
 FULL = Effort(
@@ -67,33 +58,33 @@ def _race(*arguments: Any, **work: Any) -> Entries:
 
 
 def stepping(effort: Effort, progress: Progress) -> dict[str, Entries]:
-    """Step beside all peers."""
+    """Time steps of all peers."""
     return _step(PEERS, effort.points, effort, progress)
 
 
 def drawing(effort: Effort, progress: Progress) -> dict[str, dict[str, Entries]]:
-    """Draw beside all peers, lit and flat."""
-    return _draw_beside({"lit": LIT, "flat": FLAT}, effort, progress)
+    """Time pictures of all peers, lit and flat."""
+    return _draw_peers({"lit": LIT, "flat": FLAT}, effort, progress)
 
 
 def narrow(effort: Effort, progress: Progress) -> dict[str, Any]:
-    """Step and draw beside the fastest peers with vectors of 256 bits, where the processor has wider ones."""
+    """Time the fastest peers with vectors of 256 bits, if the processor has wider ones."""
     if vector_bits() <= NARROW:
         return {}
-    beside = {"lit": {OURS: LIT[OURS]}, "flat": {name: FLAT[name] for name in (OURS, READY)}}
+    peers = {"lit": {OURS: LIT[OURS]}, "flat": {name: FLAT[name] for name in (OURS, READY)}}
     return {
         "stepping": _step(FASTEST, effort.sizes, effort, progress, bits=NARROW),
-        "drawing": _draw_beside(beside, effort, progress, bits=NARROW),
+        "drawing": _draw_peers(peers, effort, progress, bits=NARROW),
     }
 
 
 def size(effort: Effort, progress: Progress) -> dict[str, Entries]:
-    """Step sheets of every size."""
+    """Time steps of sheets of every size."""
     return _step(FASTEST, effort.sizes, effort, progress)
 
 
 def refine(effort: Effort, progress: Progress) -> dict[str, Entries]:
-    """Draw with every refinement."""
+    """Time pictures with every refinement."""
     return {
         str(n): _draw(effort, prefixed(progress, f"refine {n}"), pixels=PIXELS, refine=n, lit=True)
         for n in effort.refines
@@ -101,7 +92,7 @@ def refine(effort: Effort, progress: Progress) -> dict[str, Entries]:
 
 
 def resolution(effort: Effort, progress: Progress) -> dict[str, Entries]:
-    """Draw pictures of every size."""
+    """Time pictures of every size."""
     return {
         str(pixels): _draw(effort, prefixed(progress, f"{pixels} px"), pixels=pixels, refine=REFINE, lit=True)
         for pixels in effort.resolutions
@@ -109,22 +100,22 @@ def resolution(effort: Effort, progress: Progress) -> dict[str, Entries]:
 
 
 def threads(effort: Effort, progress: Progress) -> dict[str, dict[str, Entries]]:
-    """Step and draw with every number of threads."""
-    found: dict[str, dict[str, Entries]] = {}
+    """Time steps and pictures with every number of threads."""
+    results: dict[str, dict[str, Entries]] = {}
     for count in thread_counts():
-        say = prefixed(progress, f"{count} threads")
+        report = prefixed(progress, f"{count} threads")
         for points in THREADS_POINTS:
-            found.setdefault(f"{points} × {points} points", {})[str(count)] = _race(
-                STEPPING, FASTEST, effort.rounds, say, threads=count, points=points
+            results.setdefault(f"{points} × {points} points", {})[str(count)] = _race(
+                STEPPING, FASTEST, effort.rounds, report, threads=count, points=points
             )
-        found.setdefault(f"{PIXELS} × {PIXELS} pixels", {})[str(count)] = _draw(
-            effort, say, threads=count, pixels=PIXELS, refine=REFINE, lit=True
+        results.setdefault(f"{PIXELS} × {PIXELS} pixels", {})[str(count)] = _draw(
+            effort, report, threads=count, pixels=PIXELS, refine=REFINE, lit=True
         )
-    return found
+    return results
 
 
 def thread_counts() -> list[int]:
-    """Give 1, 2, 4, ... and all."""
+    """Return 1, 2, 4, ... and the number of available threads."""
     most = available_threads()
     return sorted({most, *(1 << k for k in range(most.bit_length()) if 1 << k < most)})
 
@@ -139,15 +130,15 @@ def _step(
     }
 
 
-def _draw_beside(
-    beside: Mapping[str, Mapping[str, str]], effort: Effort, progress: Progress, **work: Any
+def _draw_peers(
+    peers: Mapping[str, Mapping[str, str]], effort: Effort, progress: Progress, **work: Any
 ) -> dict[str, dict[str, Entries]]:
     """Time pictures of several sizes, lit and flat."""
     return {
         kind: {
             str(pixels): _race(
                 DRAWING,
-                peers,
+                modules,
                 effort.rounds,
                 prefixed(progress, f"{kind} {pixels} px"),
                 pixels=pixels,
@@ -157,7 +148,7 @@ def _draw_beside(
             )
             for pixels in effort.pixels
         }
-        for kind, peers in beside.items()
+        for kind, modules in peers.items()
     }
 
 
@@ -167,7 +158,7 @@ def _draw(effort: Effort, progress: Progress, **work: Any) -> Entries:
 
 
 def prefixed(progress: Progress, prefix: str) -> Progress:
-    """Say of what the progress is."""
+    """Return a progress that begins with a prefix."""
     return lambda text: progress(f"{prefix}: {text}")
 
 

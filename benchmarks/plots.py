@@ -1,4 +1,4 @@
-"""Cost against size, refinement, resolution and threads as pictures, in the look of `taichi-msm study`."""
+"""Plots of time against size, refinement, resolution and threads, in the style of `taichi-msm study`."""
 
 from __future__ import annotations
 
@@ -38,9 +38,8 @@ Results = dict[str, Any]
 Series = dict[str, dict[float, Timing]]
 
 
-def draw(results: Results, folder: Path) -> list[Path]:
-    """Draw what was measured; gives the pictures."""
-    made = []
+def draw(results: Results, folder: Path) -> None:
+    """Write the plots of all measured parts."""
     for name, width, panels in (
         ("size", TWO_COLUMN_WIDTH, (_per_step, _per_point)),
         ("drawing", TWO_COLUMN_WIDTH, (_refine, _resolution)),
@@ -48,10 +47,7 @@ def draw(results: Results, folder: Path) -> list[Path]:
     ):
         parts = ("refine", "resolution") if name == "drawing" else (name,)
         if all(part in results for part in parts):
-            path = folder / f"performance-{name}.png"
-            _figure(results, width, panels, path)
-            made.append(path)
-    return made
+            _figure(results, width, panels, folder / f"performance-{name}.png")
 
 
 def _figure(results: Results, width: float, panels: Iterable[Callable[[Axes, Results], None]], path: Path) -> None:
@@ -75,7 +71,7 @@ def _per_point(axes: Axes, results: Results) -> None:
 
 
 def _plot_sizes(axes: Axes, results: Results, scale: Callable[[float], float]) -> None:
-    series = by_peer(results["size"])
+    series = _by_peer(results["size"])
     _plot(axes, series, scale)
     axes.set_xlabel("n, of n × n mass points")
     _tick_at(axes.xaxis, sorted({at for times in series.values() for at in times}))
@@ -83,30 +79,29 @@ def _plot_sizes(axes: Axes, results: Results, scale: Callable[[float], float]) -
 
 
 def _refine(axes: Axes, results: Results) -> None:
-    # Along the axis are vertices, as the logarithm of a refine of 0 is nowhere.
+    # The axis is of vertices, as refine can be 0 on a logarithmic axis.
     cells = POINTS - 1
-    series = by_peer({str(cells * (int(refine) + 1) + 1): entries for refine, entries in results["refine"].items()})
+    series = _by_peer({str(cells * (int(refine) + 1) + 1): entries for refine, entries in results["refine"].items()})
     axes.set(title="Drawing against refinement", ylabel="ms", xlabel="refine; 512 × 512 pixels")
     _plot(axes, series, lambda n: 1e3)
-    # Times are so nearly the same that an axis without 0 would make hills of noise.
+    # Times are almost equal: an axis without 0 would magnify noise.
     axes.set_yscale("linear")
     axes.set_ylim(bottom=0)
     _tick_at(axes.xaxis, sorted(series["taichi_msm"]), lambda vertices: (vertices - 1) / cells - 1)
 
 
 def _resolution(axes: Axes, results: Results) -> None:
-    series = by_peer(results["resolution"])
+    series = _by_peer(results["resolution"])
     axes.set(title="Drawing against resolution", ylabel="ms", xlabel="n, of n × n pixels; 331 × 331 vertices")
     _plot(axes, series, lambda n: 1e3)
     _tick_at(axes.xaxis, sorted(series["taichi_msm"]))
 
 
 def _threads(axes: Axes, results: Results) -> None:
-    """How many times as fast as with one thread."""
     axes.set(title="Speed-up", xlabel="threads", ylabel="times as fast as with one")
     counts: set[float] = set()
     for (work, by_count), line in zip(results["threads"].items(), ("-", "--", ":"), strict=False):
-        for name, times in by_peer(by_count).items():
+        for name, times in _by_peer(by_count).items():
             if 1 not in times:
                 continue
             counts |= set(times)
@@ -117,14 +112,14 @@ def _threads(axes: Axes, results: Results) -> None:
             )
     axes.set_xscale("log")
     axes.set_yscale("log")
-    axes.plot(sorted(counts), sorted(counts), color=GREY, linewidth=0.7, label="as many times as threads")
+    axes.plot(sorted(counts), sorted(counts), color=GREY, linewidth=0.7, label="ideal")
     _tick_at(axes.xaxis, sorted(counts))
     _tick_plainly(axes.yaxis)
     axes.legend(loc="center left", bbox_to_anchor=(1.02, 0.5))
 
 
-def by_peer(measured: dict[str, list[Results]]) -> Series:
-    """Turn the entries of every size into a line for every peer."""
+def _by_peer(measured: dict[str, list[Results]]) -> Series:
+    """Return a line for every peer from the entries of every size."""
     series: Series = {}
     for at, entries in measured.items():
         for entry in entries:
@@ -134,9 +129,9 @@ def by_peer(measured: dict[str, list[Results]]) -> Series:
 
 
 def _plot(axes: Axes, series: Series, scale: Callable[[float], float]) -> None:
-    """Draw a line for every peer, and at every point a thin one from the fastest to the slowest round."""
-    for (name, times), other in zip(series.items(), OTHERS, strict=False):
-        at, colour = sorted(times), COLOURS.get(name, other)
+    """Draw a line of medians for every peer, with bars from the fastest to the slowest round."""
+    for (name, times), default in zip(series.items(), OTHERS, strict=False):
+        at, colour = sorted(times), COLOURS.get(name, default)
         lows, highs = ([scale(n) * getattr(times[n], end) for n in at] for end in ("fastest", "slowest"))
         axes.vlines(at, lows, highs, color=colour, linewidth=0.7, alpha=0.6)
         medians = [scale(n) * times[n].median for n in at]
@@ -146,8 +141,8 @@ def _plot(axes: Axes, series: Series, scale: Callable[[float], float]) -> None:
     _tick_plainly(axes.yaxis)
 
 
-def _tick_at(axis: Axis, places: list[float], name: Callable[[float], float] = lambda value: value) -> None:
-    axis.set_major_locator(FixedLocator(places))
+def _tick_at(axis: Axis, ticks: list[float], name: Callable[[float], float] = lambda value: value) -> None:
+    axis.set_major_locator(FixedLocator(ticks))
     axis.set_minor_locator(NullLocator())
     axis.set_major_formatter(FuncFormatter(lambda value, _: f"{name(value):g}"))
 

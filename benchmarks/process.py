@@ -1,4 +1,4 @@
-"""Every measurement is a process of its own: Taichi has one device a process, and pools of threads spin."""
+"""Separate processes for measurements: Taichi has one device per process, and thread pools spin."""
 
 from __future__ import annotations
 
@@ -14,14 +14,14 @@ from taichi_msm.system.compiler import COMPILER_VARIABLE, COMPILERS, active_comp
 
 ROOT = Path(__file__).parent.parent
 
-# What a run makes; ignored by git. Compiled kernels and the answers to compare with are kept for one run only.
+# Results, ignored by git; compiled kernels and reference answers are cached for one run only.
 OUTPUT = ROOT / "output" / "benchmarks"
 CACHE = OUTPUT / "cache"
 
-# A measurement that takes longer is given up [s].
-PATIENCE = 900.0
+# Longest duration of a measurement [s].
+MAX_MEASUREMENT_S = 900.0
 
-# Where a measurement is told the width of vectors that peers may take; without it, they take the processor's.
+# Environment variable with the width of vectors for peers, that of the processor by default.
 NARROW = "BENCHMARK_VECTOR_BITS"
 
 # A processor with AVX2 and FMA and without AVX-512, as GCC and LLVM call it.
@@ -29,7 +29,7 @@ AVX2 = "x86-64-v3"
 
 
 class UnavailableError(Exception):
-    """A peer cannot run here; the message says why, in a few words."""
+    """A peer cannot run on this machine; the message is the reason."""
 
 
 class FailedError(Exception):
@@ -37,16 +37,15 @@ class FailedError(Exception):
 
 
 def call(task: str, **arguments: Any) -> Any:
-    """Call a function in a process of its own.
+    """Call a function in a separate process; return its value.
 
     Args:
-        task: "module:function"; what it takes and gives is JSON.
-        arguments: of the function; `threads` also sizes the pools that look into the environment. Not passed on are
-            `bits`, the width of vectors that peers may take (None: the processor's), and `compiler`, the name of the
-            compiler of this program's kernels (None: that of this process).
+        task: "module:function"; its arguments and its value are JSON.
+        arguments: of the function; `threads` also sizes thread pools by the environment. Not passed on are `bits`, the
+            width of vectors for peers, and `compiler`, the name of the compiler of this program's kernels.
 
     Raises:
-        UnavailableError: when what it needs is not installed.
+        UnavailableError: when a requirement is not installed.
         FailedError: when it ends with another error or takes too long.
     """
     bits, compiler = arguments.pop("bits", None), arguments.pop("compiler", None)
@@ -59,10 +58,10 @@ def call(task: str, **arguments: Any) -> Any:
             capture_output=True,
             text=True,
             check=False,
-            timeout=PATIENCE,
+            timeout=MAX_MEASUREMENT_S,
         )
     except subprocess.TimeoutExpired:
-        raise FailedError(f"takes more than {PATIENCE:g} s") from None
+        raise FailedError(f"takes more than {MAX_MEASUREMENT_S:g} s") from None
     if done.returncode < 0:
         raise FailedError(f"signal {-done.returncode}")
     if done.returncode:
@@ -74,7 +73,7 @@ def call(task: str, **arguments: Any) -> Any:
 
 
 def vector_bits() -> int:
-    """Tell how wide vectors may be in this process."""
+    """Return the width of vectors for peers in this process [bits]."""
     return int(os.environ.get(NARROW) or runtime.vector_bits())
 
 

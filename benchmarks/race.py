@@ -1,4 +1,4 @@
-"""Peers take turns at the same work, each after its answer was found right."""
+"""Timing of peers in turn, each after a check of its answer."""
 
 from __future__ import annotations
 
@@ -13,21 +13,13 @@ Progress = Callable[[str], None]
 
 @dataclass
 class Entry:
-    """One peer at one piece of work.
-
-    Attributes:
-        name: of the peer.
-        said: why it was not timed; "" if it was.
-        answer: how near its answer is, in the unit of the check; None: not known.
-        compile: time to set up and compile, up to the first result [s].
-        samples: times of the work, one of each round [s].
-    """
+    """Result of one peer for one piece of work."""
 
     name: str
-    said: str = ""
-    answer: float | None = None
-    compile: float | None = None
-    samples: list[float] = field(default_factory=list)
+    failure: str = ""  # why it was not timed, or empty
+    answer: float | None = None  # accuracy of its answer, in the unit of the check
+    compile: float | None = None  # time to set up and compile, until the first result [s]
+    samples: list[float] = field(default_factory=list)  # time of the work in each round [s]
 
 
 def race(
@@ -38,29 +30,29 @@ def race(
     threads: int | None = None,
     **work: Any,
 ) -> list[Entry]:
-    """Check every peer, then time those that are right in turn.
+    """Check every peer, then time the correct ones in turn.
 
     Args:
         part: module with the functions `check` and `clock`.
-        peers: name of every peer and its module.
-        rounds: how often each is timed.
-        progress: told what is going on.
-        threads: how many a peer may take; None: every core.
-        work: arguments of both functions, besides the peer's module.
+        peers: module of each peer by its name.
+        rounds: number of samples of each peer.
+        progress: receives the current measurement.
+        threads: number of threads of a peer, by default one per core.
+        work: further arguments of both functions.
     """
     entries = []
     for name, module in peers.items():
         progress(f"{name}: check")
         entry = Entry(name)
         entries.append(entry)
-        found = _try(entry, progress, f"{part}:check", {"peer": module, "threads": threads, **work})
-        if found is not None:
-            entry.answer, entry.compile = found["answer"], found["compile"]
-            if not found["right"]:
-                entry.said = f"wrong: {found['wanted']}"
+        checked = _try(entry, progress, f"{part}:check", {"peer": module, "threads": threads, **work})
+        if checked is not None:
+            entry.answer, entry.compile = checked["answer"], checked["compile"]
+            if not checked["correct"]:
+                entry.failure = f"wrong: {checked['wanted']}"
     for number in range(rounds):
         for entry in entries:
-            if not entry.said:
+            if not entry.failure:
                 progress(f"{entry.name}: round {number + 1} of {rounds}")
                 seconds = _try(
                     entry, progress, f"{part}:clock", {"peer": peers[entry.name], "threads": threads, **work}
@@ -71,13 +63,13 @@ def race(
 
 
 def _try(entry: Entry, progress: Progress, task: str, arguments: dict[str, Any]) -> Any:
-    """Call a task; where that fails, the entry says why."""
+    """Call a task, or note its failure in the entry."""
     try:
         return call(task, **arguments)
     except UnavailableError as error:
-        entry.said = f"skipped: {error}"
+        entry.failure = f"skipped: {error}"
     except FailedError as error:
-        # The rest may name folders of this machine, which the page must not.
-        entry.said = f"failed: {str(error).split(':')[0]}"
+        # The rest may name folders of this machine.
+        entry.failure = f"failed: {str(error).split(':')[0]}"
         progress(f"{entry.name} failed: {error}")
     return None

@@ -1,6 +1,4 @@
-"""What the form in which the state is stored costs in f32: rounding against the same steps in f64.
-
-    python benchmarks/stored_form.py
+"""Rounding in f32 by the stored form of the state, against the same steps in f64.
 
 The paper's sheet (scenes/figure-3.yaml) at 18,000 steps a second, in NumPy.
 """
@@ -13,13 +11,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from benchmarks.neighbours import springs
 from taichi_msm import load_scene
 from taichi_msm.model.loads import Schedule, average_loads, decay
 from taichi_msm.model.plan import Plan
 from taichi_msm.model.sheet import rest_positions
 from taichi_msm.scene.scene import Scene
 from taichi_msm.solver.planning import make_plan
-from tests.reference.neighbours import springs
 
 SCENE = Path(__file__).parent.parent / "scenes" / "figure-3.yaml"
 STEPS_PER_SECOND = 18000
@@ -34,23 +32,23 @@ Array = NDArray[Any]
 
 
 def elastic_force(scene: Scene, values: Array, form: str) -> Array:
-    """Sum k (L - L0) (Q - P) / L in the precision of the values: positions, or displacements."""
+    """Return the sum of k (L - L0) (Q - P) / L in the precision of the values, positions or displacements."""
     real = values.dtype.type
     force = np.zeros_like(values)
     for spring in springs(scene):
-        here, there = spring.ends(scene.sheet.points)
-        between = values[there] - values[here]
+        start, end = spring.ends(scene.sheet.points)
+        between = values[end] - values[start]
         if form != "positions":
             between += np.array([*spring.offset, 0], real)
         length = np.sqrt((between * between).sum(axis=-1, keepdims=True))
-        force[here] += real(spring.stiffness) * (1 - real(spring.length) / length) * between
+        force[start] += real(spring.stiffness) * (1 - real(spring.length) / length) * between
     return force
 
 
 def displacements(plan: Plan, real: type[np.floating[Any]], form: str) -> Array:
-    """Step the scene with its state stored in one form; gives the displacements of all frames."""
-    scene, grid, made = plan.scene, plan.grid, plan.material
-    h, m = grid.step, made.mass
+    """Step the scene with its state in one form; return the displacements of all frames [m]."""
+    scene, grid, material = plan.scene, plan.grid, plan.material
+    h, m = grid.step, material.mass
     g = scene.damping / m
     keep = real((1 - g * h / 2) / (1 + g * h / 2))
     rest64 = rest_positions(scene.sheet)
@@ -59,27 +57,27 @@ def displacements(plan: Plan, real: type[np.floating[Any]], form: str) -> Array:
     share = [decay(probe, scene.sheet).astype(real)[..., None] for probe in scene.probes]
     loads: Schedule = average_loads(plan, 0, grid.steps)
     now = rest.copy() if form == "positions" else np.zeros_like(rest)
-    # The one before, or the difference from it.
-    other = now.copy()
+    # The previous state, or the difference from it.
+    before = now.copy()
     frames = []
     for n in range(len(loads.active)):
         u = now - rest if form == "positions" else now
-        force = elastic_force(scene, now, form) - real(made.virtual * loads.active[n]) * u
+        force = elastic_force(scene, now, form) - real(material.virtual * loads.active[n]) * u
         for part, strength in zip(share, loads.strength[n], strict=True):
             force += part * strength.astype(real)
         gain = real(h * h / m / (1 + g * h / 2) if n else h * h / m / 2)
         if form == "difference":
-            other = keep * other + gain * force * moves
-            now = now + other
+            before = keep * before + gain * force * moves
+            now = now + before
         else:
-            now, other = now + keep * (now - other) + gain * force * moves, now
+            now, before = now + keep * (now - before) + gain * force * moves, now
         if (n + 1) % grid.steps_per_frame == 0:
             frames.append((now.astype(float) - rest64) if form == "positions" else now.astype(float))
     return np.array(frames)
 
 
 def measure() -> dict[str, float]:
-    """Give the rounding of every form as a fraction of the largest displacement."""
+    """Return the rounding of every form, relative to the largest displacement."""
     scene = load_scene(SCENE, ["output=[]"])
     plan = make_plan(scene).with_grid(steps_per_frame=round(STEPS_PER_SECOND / scene.time.frames_per_second))
     exact = displacements(plan, np.float64, "difference")
@@ -88,14 +86,3 @@ def measure() -> dict[str, float]:
         name: float(np.linalg.norm(displacements(plan, np.float32, form) - exact, axis=-1).max() / largest)
         for name, form in FORMS.items()
     }
-
-
-def main() -> None:
-    """Print the table."""
-    print("| stored | rounding in f32 |\n|---|---:|")
-    for name, error in measure().items():
-        print(f"| {name} | {error:.2g} |")
-
-
-if __name__ == "__main__":
-    main()

@@ -1,9 +1,9 @@
-"""What a run of a sweep costs besides its stepping: seconds, bytes and files a run, here and by dask.
+"""Overhead per run of a sweep: seconds, bytes and files, on this machine and by dask.
 
     python -m benchmarks.sweep_scale [RUNS]
 
-The runs are tiny, and write only a record and a trajectory. Dask's scheduler and workers are started on this machine,
-as many workers as the sweep takes processes. Nothing else should run meanwhile.
+The runs are tiny, and write only a record and a trajectory. Dask's scheduler and workers, one per process of the sweep,
+run on this machine. Nothing else should run meanwhile.
 """
 
 from __future__ import annotations
@@ -49,36 +49,36 @@ vary:
 
 
 class Clock:
-    """Seconds, of the wall and of this process's processor, since it was last asked."""
+    """Stopwatch of wall and CPU time of this process."""
 
     def __init__(self) -> None:
         self._last = time.perf_counter(), time.process_time()
 
     def seconds(self) -> dict[str, float]:
-        """Give those seconds."""
+        """Return the seconds since the last call."""
         before, self._last = self._last, (time.perf_counter(), time.process_time())
         return {"wall": self._last[0] - before[0], "cpu": self._last[1] - before[1]}
 
 
 def measure(described: Sweep, directory: Path, executor: str | None) -> dict[str, Any]:
-    """Take all runs, and look for them again as the next command would."""
-    clock, taken = Clock(), dict[str, Any]()
+    """Execute all runs, and scan the folder as a next command would."""
+    clock, times = Clock(), dict[str, Any]()
     state = begin_sweep(described, directory)
-    taken["begin"] = clock.seconds()
-    with open_executor(executor, available_threads(), state, _ignore) as taking:
+    times["begin"] = clock.seconds()
+    with open_executor(executor, available_threads(), state, _ignore) as execution:
         clock.seconds()
-        for row in run_missing(state, taking, _ignore):
+        for row in run_missing(state, execution, _ignore):
             assert row.status == "complete", row
-        taken["run"] = clock.seconds()
+        times["run"] = clock.seconds()
         again = begin_sweep(described, directory)
-        taken["scan"] = clock.seconds()
-        finish_sweep(again, taking, _ignore)
-        taken["finish"] = clock.seconds()
-    return taken
+        times["scan"] = clock.seconds()
+        finish_sweep(again, execution, _ignore)
+        times["finish"] = clock.seconds()
+    return times
 
 
 def sizes(directory: Path, runs: int) -> dict[str, float]:
-    """Count what lies in the folder of a sweep; files and folders, their bytes and what they take of the disk."""
+    """Return files, folders, bytes and disk usage of a sweep, per run."""
     entries = list((directory / "runs").rglob("*"))
     files = [path.stat() for path in entries if path.is_file()]
     return {
@@ -93,7 +93,7 @@ def sizes(directory: Path, runs: int) -> dict[str, float]:
 
 @contextmanager
 def cluster(workers: int) -> Iterator[tuple[str, psutil.Process]]:
-    """Start a scheduler, of which the address and the process are given, and its workers."""
+    """Start a scheduler and its workers; yields the scheduler's address and process."""
     file = FOLDER / "scheduler.json"
     started = [_dask("dask_scheduler", "--host", "127.0.0.1", "--port", "0", "--scheduler-file", str(file))]
     try:
@@ -120,26 +120,26 @@ def _ignore(_stage: str, _done: int, _total: int) -> None:
 
 
 def main() -> None:
-    """Measure, and print for every run what was found."""
+    """Measure, and print the results per run."""
     runs = int(sys.argv[1]) if sys.argv[1:] else 1000
     shutil.rmtree(FOLDER, ignore_errors=True)
     FOLDER.mkdir(parents=True)
     (FOLDER / "scene.yaml").write_text(SCENE)
     (FOLDER / "sweep.yaml").write_text(SWEEP.format(runs=runs))
     described = load_sweep(FOLDER / "sweep.yaml")
-    results = {"here": measure(described, FOLDER / "here", None)}
+    results = {"local": measure(described, FOLDER / "local", None)}
     with cluster(available_threads()) as (address, scheduler):
         before, idle = scheduler.memory_info().rss, scheduler.cpu_times()
         results["dask"] = measure(described, FOLDER / "dask", address)
         after, busy = scheduler.memory_info().rss, scheduler.cpu_times()
     print(f"{runs} runs, {available_threads()} workers; for each run:")
-    for where, taken in results.items():
-        for name, seconds in taken.items():
+    for where, times in results.items():
+        for name, seconds in times.items():
             wall, cpu = (seconds[kind] / runs * 1e3 for kind in ("wall", "cpu"))
             print(f"{where:>5} {name:>6}: {wall:8.2f} ms, {cpu:7.2f} ms of the processor")
     cpu = busy.user + busy.system - idle.user - idle.system
     print(f"scheduler: {cpu / runs * 1e3:.2f} ms of the processor; it grew by {(after - before) / 2**20:.0f} MiB")
-    for name, number in sizes(FOLDER / "here", runs).items():
+    for name, number in sizes(FOLDER / "local", runs).items():
         print(f"{name:>10}: {number:.1f}")
 
 

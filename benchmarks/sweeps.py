@@ -1,4 +1,4 @@
-"""Measure sweeps here: short runs beside single commands, and how busy the cores are while a data set is made.
+"""Measure sweeps: short runs against single commands, and the use of cores while a data set is made.
 
     python -m benchmarks.sweeps
 
@@ -18,6 +18,7 @@ from typing import NamedTuple
 
 import yaml
 
+from benchmarks.marked import replace_marked
 from benchmarks.process import ROOT
 from benchmarks.whole_run import command
 from taichi_msm.system import process
@@ -32,11 +33,10 @@ FILMED = {"output": ["png", "flow", "occlusion", "depth", "tracks"]}
 FILMS, FILM_ROUNDS = 50, 2
 
 PAGE = ROOT / "docs" / "sweep.md"
-START, END = "<!-- speed: made by benchmarks/sweeps.py -->\n", "<!-- end of speed -->\n"
 
 
 def short_runs(folder: Path, cache: str) -> tuple[list[float], list[float]]:
-    """Time a sweep of short runs and some of them as single commands, in turn; two times of each round [s]."""
+    """Return times of a sweep of short runs and of some of them as single commands, measured in turn [s]."""
     file = folder / "short.yaml"
     young = {"tissue.young": {"log_uniform": [1e4, 9e4]}}
     scene = os.path.relpath(ROOT / "scenes" / "press.yaml", folder)
@@ -48,26 +48,26 @@ def short_runs(folder: Path, cache: str) -> tuple[list[float], list[float]]:
         start = time.perf_counter()
         for single in range(SINGLE):
             command("run", "scenes/press.yaml", *settings, "--out", str(folder / f"single-{single}"), cache=cache)
-        if number >= 0:  # In the first round kernels are compiled.
+        if number >= 0:  # the first round compiles
             sweeps.append(seconds)
             singles.append(time.perf_counter() - start)
     return sweeps, singles
 
 
-class Made(NamedTuple):
-    """How a data set was made; times in seconds."""
+class Timing(NamedTuple):
+    """Times of making a data set [s]."""
 
     seconds: float
-    busy: float  # processor time
+    busy: float  # CPU time
     pictures: float  # drawing, labels and encoding, in all processes
     stepping: float  # and the estimates of its error, in all processes
     frames: int
 
 
-def data_set(folder: Path, cache: str, number: int, films: int) -> Made:
-    """Make a data set of so many films."""
+def data_set(folder: Path, cache: str, number: int, films: int) -> Timing:
+    """Make a data set of some films."""
     content = yaml.safe_load(DATA_SET.read_text())
-    # In the folder of the shipped one, as it names files beside it.
+    # In the folder of the shipped file, which contains relative paths.
     file, out = DATA_SET.with_name(f"benchmark-{os.getpid()}.yaml"), folder / f"films-{number}"
     file.write_text(yaml.safe_dump({**content, "samples": films, "set": {**content.get("set", {}), **FILMED}}))
     try:
@@ -80,10 +80,10 @@ def data_set(folder: Path, cache: str, number: int, films: int) -> Made:
     records = [json.loads(path.read_text()) for path in out.glob("runs/*/run.json")]
     assert [record["status"] for record in records] == ["complete"] * films
     times = [record["timings"] for record in records]
-    stepping = sum(one["simulate"] + one.get("pilot", 0.0) for one in times)
-    pictures = sum(one["total"] - one["startup"] - one["compile"] for one in times) - stepping
+    stepping = sum(run["simulate"] + run.get("pilot", 0.0) for run in times)
+    pictures = sum(run["total"] - run["startup"] - run["compile"] for run in times) - stepping
     shutil.rmtree(out)
-    return Made(seconds, busy, pictures, stepping, sum(record["frames"] for record in records))
+    return Timing(seconds, busy, pictures, stepping, sum(record["frames"] for record in records))
 
 
 def main() -> None:
@@ -94,8 +94,8 @@ def main() -> None:
         sweeps, singles = short_runs(folder, cache)
         data_set(folder, cache, -1, films=2)  # compiles its kernels
         films = [data_set(folder, cache, number, FILMS) for number in range(FILM_ROUNDS)]
-    ratio = statistics.median(one / other for one, other in zip(sweeps, singles, strict=True))
-    made = Made(*(statistics.median(column) for column in zip(*films, strict=True)))
+    ratio = statistics.median(sweep / single for sweep, single in zip(sweeps, singles, strict=True))
+    made = Timing(*(statistics.median(column) for column in zip(*films, strict=True)))
     all_cores = cores * made.seconds
     text = (
         f"On {cores} cores of an {process.processor_name()} with vectors of {vector_bits()} bits, medians of {ROUNDS} "
@@ -109,8 +109,8 @@ def main() -> None:
         f"{made.pictures / all_cores:.0%} of the time of all cores goes to drawing, labels and encoding, "
         f"{made.stepping / all_cores:.0%} to stepping and the estimates of its error.\n"
     )
-    before, rest = PAGE.read_text(encoding="utf-8").split(START)
-    PAGE.write_text(before + START + text + END + rest.split(END)[1], encoding="utf-8")
+    page = PAGE.read_text(encoding="utf-8")
+    PAGE.write_text(replace_marked(page, "speed", "benchmarks/sweeps.py", text), encoding="utf-8")
     print(text)
 
 

@@ -1,6 +1,6 @@
-"""Taichi's own automatic differentiation: fields with the whole history, a launch a step, and its gradient."""
+"""Taichi's automatic differentiation: fields with the full history, a launch per step, and its adjoint."""
 
-# No `from __future__ import annotations` here: Taichi reads the annotations of a kernel.
+# No `from __future__ import annotations` centre: Taichi reads the annotations of a kernel.
 
 from typing import Any
 
@@ -13,13 +13,13 @@ from taichi_msm.model.loads import decay
 
 
 class Differentiated:
-    """The problem's steps; its derivatives are by the factors of the cells."""
+    """The problem's steps, differentiable by the stiffness factors of the cells."""
 
     def __init__(self, problem: Problem, steps: int, threads: int) -> None:
         ti.init(arch=ti.cpu, log_level=ti.ERROR, cpu_max_num_threads=threads, default_fp=ti.f64)
         n, material, self._steps = problem.points, problem.material, steps
         self._factors = factors = ti.field(ti.f64, shape=(n - 1, n - 1), needs_grad=True)
-        # Of springs to the right and down, and of both diagonals of a cell.
+        # Stiffness of springs to the right and down, and of both diagonals of a cell.
         across, down, shear = (ti.field(ti.f64, shape=(n, n), needs_grad=True) for _ in range(3))
         self._u = u = ti.Vector.field(3, ti.f64, shape=(steps + 1, n, n), needs_grad=True)
         self._loss = loss = ti.field(ti.f64, shape=(), needs_grad=True)
@@ -46,17 +46,17 @@ class Differentiated:
         @ti.kernel
         def step(t: ti.i32):
             for i, j in ti.ndrange((1, n - 1), (1, n - 1)):
-                here = u[t, i, j]
-                force = load[i, j] - virtual * here
-                force += pull(across[i, j], u[t, i, j + 1] - here + ti.Vector([dx, 0.0, 0.0]), dx)
-                force += pull(across[i, j - 1], u[t, i, j - 1] - here - ti.Vector([dx, 0.0, 0.0]), dx)
-                force += pull(down[i, j], u[t, i + 1, j] - here - ti.Vector([0.0, dx, 0.0]), dx)
-                force += pull(down[i - 1, j], u[t, i - 1, j] - here + ti.Vector([0.0, dx, 0.0]), dx)
-                force += pull(shear[i, j], u[t, i + 1, j + 1] - here + ti.Vector([dx, -dx, 0.0]), diagonal)
-                force += pull(shear[i, j - 1], u[t, i + 1, j - 1] - here - ti.Vector([dx, dx, 0.0]), diagonal)
-                force += pull(shear[i - 1, j], u[t, i - 1, j + 1] - here + ti.Vector([dx, dx, 0.0]), diagonal)
-                force += pull(shear[i - 1, j - 1], u[t, i - 1, j - 1] - here - ti.Vector([dx, -dx, 0.0]), diagonal)
-                u[t + 1, i, j] = here + keep * (here - u[t - 1, i, j]) + gain * force
+                centre = u[t, i, j]
+                force = load[i, j] - virtual * centre
+                force += pull(across[i, j], u[t, i, j + 1] - centre + ti.Vector([dx, 0.0, 0.0]), dx)
+                force += pull(across[i, j - 1], u[t, i, j - 1] - centre - ti.Vector([dx, 0.0, 0.0]), dx)
+                force += pull(down[i, j], u[t, i + 1, j] - centre - ti.Vector([0.0, dx, 0.0]), dx)
+                force += pull(down[i - 1, j], u[t, i - 1, j] - centre + ti.Vector([0.0, dx, 0.0]), dx)
+                force += pull(shear[i, j], u[t, i + 1, j + 1] - centre + ti.Vector([dx, -dx, 0.0]), diagonal)
+                force += pull(shear[i, j - 1], u[t, i + 1, j - 1] - centre - ti.Vector([dx, dx, 0.0]), diagonal)
+                force += pull(shear[i - 1, j], u[t, i - 1, j + 1] - centre + ti.Vector([dx, dx, 0.0]), diagonal)
+                force += pull(shear[i - 1, j - 1], u[t, i - 1, j - 1] - centre - ti.Vector([dx, -dx, 0.0]), diagonal)
+                u[t + 1, i, j] = centre + keep * (centre - u[t - 1, i, j]) + gain * force
 
         @ti.kernel
         def begin():
@@ -82,7 +82,7 @@ class Differentiated:
         ti.sync()
 
     def differentiate(self) -> None:
-        """Take all steps, and go back."""
+        """Take all steps, and propagate the gradient back."""
         self.run()
         self._loss[None] = 0
         self._evaluate()
@@ -95,6 +95,6 @@ class Differentiated:
         self._assemble.grad()
         ti.sync()
 
-    def slope(self) -> NDArray[Any]:
-        """Give the derivatives, shape (n - 1, n - 1)."""
+    def gradient(self) -> NDArray[Any]:
+        """Return the derivatives of the loss by the factors, shape (n - 1, n - 1)."""
         return self._factors.grad.to_numpy()

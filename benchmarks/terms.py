@@ -1,16 +1,17 @@
-"""What a step costs with each term of tissue, beside a sheet in springs; all in turn in one process."""
+"""Time of a step with each term of tissue, against a sheet of springs; in turn, in one process."""
 
 from __future__ import annotations
 
 import math
 import tempfile
-import time
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from PIL import Image
 
+from benchmarks.clock import in_turn
 from benchmarks.process import call
 from benchmarks.race import Progress
 from taichi_msm.scene.scene import Scene
@@ -24,7 +25,7 @@ PRECISIONS = ("f32", "f64")
 
 SPRINGS = "springs"
 
-# Steps of points of one sample: some 30 ms.
+# Point updates of one sample, about 30 ms.
 POINT_STEPS = 10_000_000
 
 TISSUE = {"young": 3e4, "thickness": 2e-3, "density": 1050, "foundation": 2e6, "damping": 40}
@@ -33,7 +34,7 @@ PRETENSION = {"pretension": 5}
 
 PRESSED = {"total": [0, 0, -2], "radius": 0.004, "falloff": 300}
 
-# A rod that is pressed in and stays there; before anything is timed it is down [s].
+# A capsule that is pressed in and stays; timing begins when it is down [s].
 DOWN = 5e-3
 MOVED = {
     "path": [[0, 0.5, 0.5, 0], [DOWN, 0.5, 0.5, -0.006]],
@@ -42,7 +43,7 @@ MOVED = {
 
 
 def variants(points: int, precision: str, image: str) -> dict[str, Scene]:
-    """Make the scenes: the same tissue, with one term more or with all."""
+    """Return the scenes: the same tissue, with one additional term or with all."""
     stiffness_map = {"map": {"image": image, "range": [1, 1.5]}}
 
     def scene(sheet: dict[str, Any], **others: Any) -> Scene:
@@ -70,7 +71,7 @@ def variants(points: int, precision: str, image: str) -> dict[str, Scene]:
 
 
 def cost(points: int, precision: str, rounds: int) -> dict[str, list[float]]:
-    """Time a step of every variant [s], in turn."""
+    """Return times of a step of every variant [s], measured in turn."""
     device = runtime.start("cpu", available_threads())
     count = max(1, POINT_STEPS // points**2)
     with tempfile.TemporaryDirectory() as folder:
@@ -81,21 +82,16 @@ def cost(points: int, precision: str, rounds: int) -> dict[str, list[float]]:
         }
     for sheet in sheets.values():
         sheet.advance(math.ceil(DOWN * sheet.plan.grid.steps_per_second))
-    samples: dict[str, list[float]] = {name: [] for name in sheets}
-    for _ in range(rounds):
-        for name, sheet in sheets.items():
-            start = time.perf_counter()
-            sheet.advance(count)
-            samples[name].append((time.perf_counter() - start) / count)
-    return samples
+    samples = in_turn({name: partial(sheet.advance, count) for name, sheet in sheets.items()}, rounds)
+    return {name: [seconds / count for seconds in times] for name, times in samples.items()}
 
 
 def measure(rounds: int, progress: Progress) -> dict[str, dict[str, list[float]]]:
-    """Time all variants of every size and precision; the keys are such as "331 × 331, f32"."""
-    found = {}
+    """Time all variants by size and precision, such as "331 × 331, f32"."""
+    results = {}
     for precision in PRECISIONS:
         for points in POINTS:
             progress(f"{points} x {points}, {precision}")
             name = f"{points} × {points}, {precision}"
-            found[name] = call("benchmarks.terms:cost", points=points, precision=precision, rounds=4 * rounds)
-    return found
+            results[name] = call("benchmarks.terms:cost", points=points, precision=precision, rounds=4 * rounds)
+    return results

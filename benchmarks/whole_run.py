@@ -1,4 +1,4 @@
-"""A whole run of the program, with an empty cache of compiled kernels and with a warm one, and a check."""
+"""Time of a whole run, with an empty and with a warm cache of compiled kernels, and of a check."""
 
 from __future__ import annotations
 
@@ -19,15 +19,15 @@ Samples = dict[str, dict[str, list[float]]]
 
 
 def command(*arguments: str, cache: str, compiler: str | None = None) -> tuple[float, str]:
-    """Run the program; gives its time from start to end [s], and what it printed.
+    """Run the program; return its time from start to end [s], and its output.
 
     Args:
         arguments: of the command line.
         cache: folder of compiled kernels.
-        compiler: name of the compiler; None: that of this process.
+        compiler: name of the compiler, by default that of this process.
     """
     used = COMPILERS[compiler] if compiler else active_compiler()
-    # Python keeps what it compiles, as it does for a user.
+    # With cached bytecode, as for a user.
     environment = {name: value for name, value in os.environ.items() if name != "PYTHONDONTWRITEBYTECODE"}
     start = time.perf_counter()
     done = subprocess.run(
@@ -42,19 +42,19 @@ def command(*arguments: str, cache: str, compiler: str | None = None) -> tuple[f
 
 
 def measure(rounds: int, progress: Progress) -> Samples:
-    """Run and check in turn; gives the times of every stage of a cold and a warm run, and of a check [s]."""
-    found: Samples = {"cold": {}, "warm": {}, "check": {}}
+    """Return times of every stage of a cold run, a warm run and a check, measured in turn [s]."""
+    samples: Samples = {"cold": {}, "warm": {}, "check": {}}
     with tempfile.TemporaryDirectory() as directory:
-        # Not timed: after it, modules of Python are compiled, as they are by pip where it installs them.
+        # Not timed: compiles the bytecode, as pip does at installation.
         command("run", SCENE, "--json", "--out", f"{directory}/out", cache=f"{directory}/cache")
         for number in range(rounds):
             progress(f"round {number + 1} of {rounds}")
             cache = f"{directory}/cache{number}"
             for kind in ("cold", "warm"):
                 seconds, text = command("run", SCENE, "--json", "--out", f"{directory}/out", cache=cache)
-                _add(found[kind], {"process": seconds, **json.loads(text)["timings"]})
-            _add(found["check"], {"process": command("check", SCENE, cache=cache)[0]})
-    return found
+                _add(samples[kind], {"process": seconds, **json.loads(text)["timings"]})
+            _add(samples["check"], {"process": command("check", SCENE, cache=cache)[0]})
+    return samples
 
 
 def _add(samples: dict[str, list[float]], stages: dict[str, float]) -> None:

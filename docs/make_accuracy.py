@@ -1,4 +1,4 @@
-"""Write docs/accuracy.md and its pictures: a study of every shipped scene, and what becomes of the hard cases.
+"""Write docs/accuracy.md and its pictures: a study of every shipped scene, and the results of the hard cases.
 
     PYTHONPATH=. python docs/make_accuracy.py [--quick]
 
@@ -19,9 +19,8 @@ from pathlib import Path
 from typing import Any
 
 from benchmarks import dop853, stored_form
-from taichi_msm.study.format import markdown_table
+from benchmarks.marked import table
 from taichi_msm.study.measurements import REFERENCE_MARGIN, REFERENCE_RENDER
-from taichi_msm.study.result import PSNR_TOLERANCE_DB
 from taichi_msm.system.compiler import compiler_label
 
 ROOT = Path(__file__).parent.parent
@@ -41,7 +40,7 @@ def program(*arguments: str) -> subprocess.CompletedProcess[str]:
 
 
 def study(name: str, out: Path, *options: str) -> Record:
-    """Study a shipped scene and keep its picture."""
+    """Study a shipped scene, copy its picture, and return the record."""
     words = ["study", f"scenes/{name}.yaml", "--tolerance", str(TOLERANCE), "--json", "--out", str(out / name)]
     done = program(*words, *options)
     if done.returncode:
@@ -50,133 +49,120 @@ def study(name: str, out: Path, *options: str) -> Record:
     return json.loads(done.stdout)
 
 
-def points(found: Record, method: str) -> list[Record]:
-    """Pick the points of one method of stepping, by falling steps."""
+def points(study: Record, method: str) -> list[Record]:
+    """Return the runs of one method, such as "f32 central", by falling steps."""
     precision, difference = method.split()
     return [
-        one
-        for one in found["stepping"]
-        if (one["precision"], one["damping_difference"]) == (precision, difference) and one["error"] is not None
+        point
+        for point in study["stepping"]
+        if (point["precision"], point["damping_difference"]) == (precision, difference) and point["error"] is not None
     ]
 
 
-def seconds_to(found: Record, method: str, error: float) -> float:
-    """Interpolate the time that a method takes to an error, on logarithmic axes."""
-    known = [(math.log(one["error"]), math.log(one["seconds"]["median"])) for one in points(found, method)]
-    for (coarse, before), (fine, after) in pairwise(known):
+def seconds_to(study: Record, method: str, error: float) -> float:
+    """Interpolate a method's time for an error, on logarithmic axes."""
+    logs = [(math.log(point["error"]), math.log(point["seconds"]["median"])) for point in points(study, method)]
+    for (coarse, before), (fine, after) in pairwise(logs):
         if fine <= math.log(error) <= coarse:
             return math.exp(before + (after - before) * (coarse - math.log(error)) / (coarse - fine))
     return math.nan
 
 
 def significant(value: float | None, digits: int = 2) -> str:
-    """Write a number for a table."""
+    """Format a number for a table."""
     if value is None or math.isnan(value):
         return "-"
     text = f"{value:.{digits}g}"
     return f"{float(text):g}" if 1 <= value < 1e5 else text
 
 
-def table(head: list[str], rows: list[list[str]]) -> str:
-    """Write a table, its first column of text and the others of numbers."""
-    return markdown_table(head, rows, left_columns=(0,))
-
-
 def scene_table(studies: dict[str, Record]) -> str:
-    """Show for every scene how exact central differences can be in f32 and in f64, and at what price."""
+    """Table of the errors of central differences in f32 and in f64, and of their times, by scene."""
     rows = []
-    for name, found in studies.items():
-        single, double = points(found, "f32 central"), points(found, "f64 central")
+    for name, study in studies.items():
+        single, double = points(study, "f32 central"), points(study, "f64 central")
         rows.append(
             [
                 f"`{name}`",
                 significant(single[0]["error"]),
-                significant(min(one["error"] for one in single)),
-                significant(max(one["rounding"] for one in single)),
-                significant(min(one["error"] for one in double)),
-                significant(price_of_double(found)),
+                significant(min(point["error"] for point in single)),
+                significant(max(point["rounding"] for point in single)),
+                significant(min(point["error"] for point in double)),
+                significant(price_of_double(study)),
             ]
         )
-    head = [
-        "scene",
-        "f32, largest stable step",
-        "f32, best",
-        "rounding in f32, worst",
-        "f64, best",
-        "time of f64 / f32",
-    ]
-    return table(head, rows)
+    head = ["f32, largest stable step", "f32, best", "rounding in f32, worst", "f64, best", "time of f64 / f32"]
+    return table(["scene", *head], rows)
 
 
-def error_at(found: Record, method: str, step: float) -> float | None:
-    """Interpolate the error of a method at a step, on logarithmic axes; None: outside what was measured."""
-    for coarse, fine in pairwise(points(found, method)):
+def error_at(study: Record, method: str, step: float) -> float | None:
+    """Interpolate the error of a method at a step, on logarithmic axes; None outside the measured steps."""
+    for coarse, fine in pairwise(points(study, method)):
         if fine["step"] <= step <= coarse["step"]:
             share = math.log(coarse["step"] / step) / math.log(coarse["step"] / fine["step"])
             return float(coarse["error"] * (fine["error"] / coarse["error"]) ** share)
     return None
 
 
-def difference_table(found: Record) -> str:
-    """Show central beside backward differences at the same steps."""
+def difference_table(study: Record) -> str:
+    """Table of the errors of central and backward differences at the same steps."""
     rows = []
-    for one in points(found, "f64 central"):
-        if (backward := error_at(found, "f64 backward", one["step"])) is not None:
-            ratio = backward / one["error"]
-            rows.append([f"{1000 * one['step']:.4g} ms", *map(significant, (one["error"], backward, ratio))])
+    for point in points(study, "f64 central"):
+        if (backward := error_at(study, "f64 backward", point["step"])) is not None:
+            errors = point["error"], backward, backward / point["error"]
+            rows.append([f"{1000 * point['step']:.4g} ms", *map(significant, errors)])
     return table(["step", "central", "backward", "ratio"], rows)
 
 
 def refine_table(studies: dict[str, Record]) -> str:
-    """Show for every scene what refining buys, at one sample a pixel."""
+    """Table of the PSNR by refinement, with one sample per pixel, by scene."""
     drawn = {
-        name: {one["refine"]: one for one in found["drawing"] if one["supersample"] == 1}
-        for name, found in studies.items()
+        name: {point["refine"]: point for point in study["drawing"] if point["supersample"] == 1}
+        for name, study in studies.items()
     }
-    refines = sorted(set.intersection(*(set(each) for each in drawn.values())))
-    rows = [[f"`{name}`", *(f"{each[refine]['psnr']:.1f}" for refine in refines)] for name, each in drawn.items()]
+    refines = sorted(set.intersection(*map(set, drawn.values())))
+    rows = [[f"`{name}`", *(f"{by[refine]['psnr']:.1f}" for refine in refines)] for name, by in drawn.items()]
     return table(["PSNR [dB] at refine", *map(str, refines)], rows)
 
 
-def supersample_table(found: Record) -> str:
-    """Show what supersampling buys and costs, at the scene's own refinement."""
-    own = found["settings"]["render"]["refine"]
+def supersample_table(study: Record) -> str:
+    """Table of the errors and times of supersampling, with the scene's refinement."""
     rows = [
         [
-            str(one["supersample"]),
-            f"{one['psnr']:.1f}",
-            str(one["largest_error"]),
-            f"{1000 * one['seconds']['median']:.1f}",
+            str(point["supersample"]),
+            f"{point['psnr']:.1f}",
+            str(point["largest_error"]),
+            f"{1000 * point['seconds']['median']:.1f}",
         ]
-        for one in found["drawing"]
-        if one["refine"] == own
+        for point in study["drawing"]
+        if point["refine"] == study["settings"]["render"]["refine"]
     ]
     return table(["supersample", "PSNR [dB]", "largest error", "ms a frame"], rows)
 
 
 def hard_rows(out: Path) -> list[list[str]]:
-    """Run the hard cases as a user would."""
+    """Run the hard cases by the command line; return their rows."""
     rows = []
     for path in HARD:
         text = path.read_text(encoding="utf-8").splitlines()
-        says = " ".join(line.lstrip("# ") for line in takewhile(lambda line: line.startswith("#"), text))
+        purpose = " ".join(line.lstrip("# ") for line in takewhile(lambda line: line.startswith("#"), text))
         print(path.stem, flush=True)
         done = program("run", str(path.relative_to(ROOT)), "--estimate-error", "--json", "--out", str(out / path.stem))
         record = json.loads(done.stdout)
         if "scene" not in record:
             reason = done.stderr.strip().split(": ", 1)[1]
-            rows.append([f"`{path.stem}`", says, f"refused: {reason}", "-", "-", "-"])
+            rows.append([f"`{path.stem}`", purpose, f"refused: {reason}", "-", "-", "-"])
             continue
         error = record["error_estimate"]["error"]
         # The first note is the error itself.
-        happens = "; ".join(["runs", *(f"says: {note}" for note in record["notes"][1:])])
+        result = "; ".join(["runs", *(f"warns: {note}" for note in record["notes"][1:])])
         if record["status"] != "complete":
-            happens = f"stopped: {record['error']}"
+            result = f"stopped: {record['error']}"
         rows.append(
             [
                 f"`{path.stem}`",
-                says,
-                happens,
+                purpose,
+                result,
                 "not known" if error is None else significant(error),
                 significant(record["shortest_spring"]),
                 f"{record['steps']:,}",
@@ -186,16 +172,16 @@ def hard_rows(out: Path) -> list[list[str]]:
 
 
 def hard_table(out: Path) -> str:
-    """Write the table of the hard cases, whose second and third columns are text."""
-    head = ["scene", "what is hard, and what must happen", "what happens", "error", "shortest spring", "steps"]
+    """Format the table of the hard cases, whose first three columns are text."""
+    head = ["scene", "difficulty and expected result", "result", "error", "shortest spring", "steps"]
     lines = ["| " + " | ".join(head) + " |", "|---|---|---|---:|---:|---:|"]
     return "\n".join(lines + ["| " + " | ".join(row) + " |" for row in hard_rows(out)])
 
 
-def peer(found: Record) -> str:
-    """Say what DOP853 takes for its fastest error within the tolerance."""
+def peer(study: Record) -> str:
+    """Format the time of DOP853 for an error within the tolerance, and this program's in f64."""
     seconds, error = min(pair for pair in dop853.measure().values() if pair[1] <= TOLERANCE)
-    ours = points(found, "f64 central")[-1]
+    ours = points(study, "f64 central")[-1]
     return (
         f"takes {seconds:.3g} s for an error of {significant(error)}; this program in f64 "
         f"takes {ours['seconds']['median']:.2g} s for {significant(ours['error'])}"
@@ -203,29 +189,31 @@ def peer(found: Record) -> str:
 
 
 def enough(studies: dict[str, Record]) -> int:
-    """Find the refinement from which no scene gains."""
+    """Return the refinement beyond which no scene improves by 0.1 dB."""
     needed = []
-    for found in studies.values():
-        drawn = [one for one in found["drawing"] if one["supersample"] == 1]
-        best = max(one["psnr"] for one in drawn)
-        needed.append(min(one["refine"] for one in drawn if one["psnr"] > best - PSNR_TOLERANCE_DB))
+    for study in studies.values():
+        drawn = [point for point in study["drawing"] if point["supersample"] == 1]
+        best = max(point["psnr"] for point in drawn)
+        needed.append(min(point["refine"] for point in drawn if point["psnr"] > best - 0.1))
     return max(needed)
 
 
-def cost_of_backward(found: Record, error: float) -> float:
-    """Compare the times of both differences for an error."""
-    return seconds_to(found, "f64 backward", error) / seconds_to(found, "f64 central", error)
+def cost_of_backward(study: Record, error: float) -> float:
+    """Return the time of backward over that of central differences for an error."""
+    return seconds_to(study, "f64 backward", error) / seconds_to(study, "f64 central", error)
 
 
-def price_of_double(found: Record) -> float:
-    """Give the median over all steps of the time in f64 over that in f32."""
-    double = {one["steps_per_frame"]: one["seconds"]["median"] for one in points(found, "f64 central")}
-    single = {one["steps_per_frame"]: one["seconds"]["median"] for one in points(found, "f32 central")}
+def price_of_double(study: Record) -> float:
+    """Return the median over all steps of the time in f64 over that in f32."""
+    single, double = (
+        {point["steps_per_frame"]: point["seconds"]["median"] for point in points(study, f"{precision} central")}
+        for precision in ("f32", "f64")
+    )
     return statistics.median(double[steps] / single[steps] for steps in single if steps in double)
 
 
 def sensitive(out: Path) -> float:
-    """Give the rounding in f32 of a sheet in springs that wrinkles."""
+    """Return the rounding in f32 of a sheet of springs that wrinkles."""
     changes = ("springs.structural=100", "springs.shear=100", "output=[]", "time.precision=f32")
     settings = [word for change in changes for word in ("--set", change)]
     done = program("run", "docs/springs.yaml", *settings, "--estimate-error", "--json", "--out", str(out / "sensitive"))

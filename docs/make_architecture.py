@@ -1,15 +1,12 @@
-"""Draw the layers of the package and the imports between them, as the source has them.
-
-An import that others lead to as well is not drawn.
+"""Draw the layers of the package and the imports between them (transitive reduction), from the source.
 
     PYTHONPATH=. python docs/make_architecture.py
 
-writes docs/images/architecture.png.
+Writes docs/images/architecture.png.
 """
 
 from __future__ import annotations
 
-import sys
 from collections import Counter
 from pathlib import Path
 
@@ -18,28 +15,24 @@ from matplotlib.figure import Figure
 from matplotlib.patches import FancyArrowPatch, FancyBboxPatch
 
 from taichi_msm.plot_style import BLUE, DPI, GREY, INK
+from tests.test_architecture import LAYERS, MODULES, imports, module_name
 
-ROOT = Path(__file__).parent.parent
-sys.path.insert(0, str(ROOT))
-
-from tests.test_architecture import LAYERS, MODULES, imports, module_name  # noqa: E402
-
-# What a person calls or reads; __init__ and __main__ only lead there.
+# Without __init__ and __main__, which only lead to the others.
 SHOWN = [[name for name in sorted(layer) if not name.startswith("__")] for layer in LAYERS]
 WIDTH, HEIGHT, GAP, PITCH = 1.7, 0.62, 1.12, 2.3
 
 
 def arrows() -> Counter[tuple[str, str]]:
     """Count the imports from a module or package to another."""
-    found: Counter[tuple[str, str]] = Counter()
+    edges: Counter[tuple[str, str]] = Counter()
     for path in MODULES:
-        own = module_name(path).split(".")[0]
-        found.update((own, other) for name in imports(path) if (other := name.split(".")[0]) != own)
-    return found
+        upper = module_name(path).split(".")[0]
+        edges.update((upper, lower) for name in imports(path) if (lower := name.split(".")[0]) != upper)
+    return edges
 
 
 def direct(edges: Counter[tuple[str, str]]) -> Counter[tuple[str, str]]:
-    """Keep the arrows that no way over others makes needless."""
+    """Return the edges of the transitive reduction."""
 
     def leads(start: str, end: str) -> bool:
         return any(lower == end or leads(lower, end) for upper, lower in edges if upper == start)
@@ -48,15 +41,15 @@ def direct(edges: Counter[tuple[str, str]]) -> Counter[tuple[str, str]]:
         {
             (upper, lower): count
             for (upper, lower), count in edges.items()
-            if not any(leads(other, lower) for start, other in edges if start == upper and other != lower)
+            if not any(leads(middle, lower) for start, middle in edges if start == upper and middle != lower)
         }
     )
 
 
 def main() -> None:
-    """Draw."""
+    """Write the diagram."""
     layers = [layer for layer in SHOWN if layer]
-    place = {
+    centres = {
         name: (PITCH * (column - (len(layer) - 1) / 2), GAP * level)
         for level, layer in enumerate(layers)
         for column, name in enumerate(layer)
@@ -69,8 +62,8 @@ def main() -> None:
     axes.set_xlim(-reach, reach)
     axes.set_ylim(-0.6, GAP * (len(layers) - 1) + 0.6)
     for (upper, lower), count in direct(arrows()).items():
-        if upper in place and lower in place:
-            (x, y), (to_x, to_y) = place[upper], place[lower]
+        if upper in centres and lower in centres:
+            (x, y), (to_x, to_y) = centres[upper], centres[lower]
             bend = 0.0 if abs(x - to_x) > 0.1 or y - to_y < 1.5 * GAP else 0.45
             arrow = FancyArrowPatch(
                 (x, y - HEIGHT / 2),
@@ -84,7 +77,7 @@ def main() -> None:
             )
             axes.add_patch(arrow)
     packages = {path.parent.name for path in MODULES if path.name == "__init__.py"}
-    for name, (x, y) in place.items():
+    for name, (x, y) in centres.items():
         filled = name in packages
         box = FancyBboxPatch(
             (x - WIDTH / 2, y - HEIGHT / 2),
@@ -99,7 +92,7 @@ def main() -> None:
         axes.add_patch(box)
         text = f"{name}/" if filled else f"{name}.py"
         axes.text(x, y, text, ha="center", va="center", color="white" if filled else INK, fontsize=10, zorder=4)
-    figure.savefig(ROOT / "docs" / "images" / "architecture.png", format="png")
+    figure.savefig(Path(__file__).parent / "images" / "architecture.png", format="png")
 
 
 if __name__ == "__main__":

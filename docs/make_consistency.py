@@ -1,4 +1,4 @@
-"""Write the table of labels.md that tells how far apart labels are that must agree, as the tests measure it.
+"""Write the table of largest deviations between labels into labels.md, as measured by tests/test_consistency.py.
 
 PYTHONPATH=. python docs/make_consistency.py
 """
@@ -8,37 +8,37 @@ from __future__ import annotations
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
+from benchmarks.marked import replace_marked
 from taichi_msm import run
-from tests.test_consistency import AGREEMENTS, CAMERAS, measured, scene
+from tests.test_consistency import AGREEMENTS, CAMERAS, largest_deviations, scene
 
 PAGE = Path(__file__).parent / "labels.md"
-START, END = "<!-- consistency: made by docs/make_consistency.py -->\n", "<!-- end of consistency -->\n"
 THREADS = 2
 
 
-def cell(apart: float | None) -> str:
-    """Write a number with one digit."""
-    return "" if apart is None else f"{apart:.1g}".replace("e-0", "e-")
+def cell(deviation: float | None) -> str:
+    """Format a number with one digit."""
+    return "" if deviation is None else f"{deviation:.1g}".replace("e-0", "e-")
 
 
 def table() -> str:
-    """Give a row for every two things that must agree, and a column for every camera."""
+    """Return the table: a row for each agreement, a column for each camera."""
     worst = {}
     for name, camera in CAMERAS.items():
         with TemporaryDirectory() as folder:
             run(scene(camera), folder, threads=THREADS, estimate_error=False)
-            worst[name] = measured(Path(folder), name, THREADS)
+            worst[name] = largest_deviations(Path(folder), name, THREADS)
     lines = [f"| at most apart | in | {' | '.join(CAMERAS)} | bound |", f"|---|---|{'---|' * len(CAMERAS)}---|"]
-    for what, (said, unit, bound) in AGREEMENTS.items():
-        cells = [cell(worst[name].get(what)) for name in CAMERAS]
-        lines.append(f"| {said} | {unit} | {' | '.join(cells)} | {cell(bound)} |")
+    for key, (description, unit, bound) in AGREEMENTS.items():
+        cells = [cell(worst[name].get(key)) for name in CAMERAS]
+        lines.append(f"| {description} | {unit} | {' | '.join(cells)} | {cell(bound)} |")
     return "\n".join(lines) + "\n"
 
 
 def main() -> None:
-    """Renew the table."""
-    before, rest = PAGE.read_text(encoding="utf-8").split(START)
-    PAGE.write_text(before + START + table() + END + rest.split(END)[1], encoding="utf-8")
+    """Write the table."""
+    page = PAGE.read_text(encoding="utf-8")
+    PAGE.write_text(replace_marked(page, "consistency", "docs/make_consistency.py", table()), encoding="utf-8")
 
 
 if __name__ == "__main__":

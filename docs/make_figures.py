@@ -1,4 +1,4 @@
-"""Make the pictures of the README and of the pages on scenes, labels, sweeps and live sessions, from what is shipped.
+"""Make the pictures of the README and of the pages on scenes, labels, sweeps and live sessions.
 
     PYTHONPATH=. python docs/make_figures.py
 
@@ -36,7 +36,7 @@ ROOT = Path(__file__).parent.parent
 SCENES = ROOT / "scenes"
 IMAGES = ROOT / "docs" / "images"
 
-# For every scene the moment that shows it best [s].
+# The most characteristic moment of each scene [s].
 MOMENTS = {"drag": 1.12, "two-tools": 0.84, "tumour": 2.2}
 
 # The stages of the paper's figure 3: at rest, pressed, pressed fully, let go.
@@ -58,7 +58,7 @@ def frames(scene_file: Path, moments: tuple[float, ...], size: tuple[int, int]) 
 
 
 def animation(name: str, scene: str, size: int, *overrides: str, image: Path | None = None) -> None:
-    """Keep the GIF of a scene, in another size or on another picture."""
+    """Write the GIF of a scene, in another size or on another picture."""
     settings = [f"render.size=[{size},{size}]", "render.supersample=2", "output=[gif]", *overrides]
     with tempfile.TemporaryDirectory() as directory:
         run(load_scene(SCENES / f"{scene}.yaml", settings, image), directory, overrides=settings)
@@ -66,23 +66,23 @@ def animation(name: str, scene: str, size: int, *overrides: str, image: Path | N
 
 
 def endoscope(size: int) -> None:
-    """Keep the GIF of the scene endoscope, in another size, with every fourth frame."""
-    given = load_scene(SCENES / "endoscope.yaml")
-    assert isinstance(given.render.camera, Camera)
-    assert given.render.camera.intrinsics is not None
-    share = size / given.render.size[0]
+    """Write the GIF of the scene endoscope, in another size, with every fourth frame."""
+    shipped = load_scene(SCENES / "endoscope.yaml")
+    assert isinstance(shipped.render.camera, Camera)
+    assert shipped.render.camera.intrinsics is not None
+    share = size / shipped.render.size[0]
     # The principal point, from the picture's corner, is half a pixel more.
     values = {
         name: round((value + 0.5) * share - 0.5 if name in ("cx", "cy") else value * share, 2)
-        for name, value in given.render.camera.intrinsics.model_dump().items()
+        for name, value in shipped.render.camera.intrinsics.model_dump().items()
     }
-    rate = given.time.frames_per_second / 4
+    rate = shipped.time.frames_per_second / 4
     smaller = (f"render.camera.intrinsics={json.dumps(values)}", f"time.frames_per_second={rate:g}")
     animation("endoscope", "endoscope", size, *smaller)
 
 
 def four_pixels() -> None:
-    """Draw the upper left pixels of a picture, and what the two conventions call their centres and corners."""
+    """Draw the upper left pixels of a picture with both conventions of coordinates."""
     figure, axes = plt.subplots(figsize=(5.6, 3.9), layout="constrained")
     axes.set(xlim=(-0.75, 2.75), ylim=(2.5, -0.75), aspect="equal")
     axes.axis("off")
@@ -104,7 +104,7 @@ def four_pixels() -> None:
 
 
 def stereo(moment: float, size: int) -> None:
-    """Show what two cameras see of the scene grasp at a moment [s], and the disparity of the left one."""
+    """Draw the scene grasp from two cameras at a moment [s], and the disparity of the left one."""
     right = {"beside": "left", "baseline": 0.005}
     camera = load_scene(SCENES / "grasp.yaml").render.camera
     assert isinstance(camera, Camera)
@@ -129,15 +129,15 @@ def stereo(moment: float, size: int) -> None:
 
 
 def forces_of(name: str) -> tuple[Floats, Floats, Floats]:
-    """Return the times [s], the places of the tip [m] and the forces [N] of a scene's only tool in every frame."""
+    """Return the times [s], positions of the tip [m] and forces [N] of a scene's only tool in all frames."""
     time, tip, force = [], [], []
     with Simulation(load_scene(SCENES / f"{name}.yaml", {"output": []})) as simulation:
         for frame in range(simulation.scene.time.frames + 1):
             simulation.advance(min(frame, 1))
-            (felt,) = simulation.forces()
+            (tool,) = simulation.forces()
             time.append(simulation.time)
-            tip.append(felt.tip)
-            force.append(felt.force)
+            tip.append(tool.tip)
+            force.append(tool.force)
     return np.array(time), np.array(tip), np.array(force)
 
 
@@ -163,25 +163,25 @@ def indentation() -> None:
 
 
 def palpation() -> None:
-    """Plot the force that a finger feels at each place of the scene tumour, above the map of stiffness."""
+    """Plot the force on the finger at each position of the scene tumour, above the map of stiffness."""
     _, tip, force = forces_of("tumour")
     scene = load_scene(SCENES / "tumour.yaml")
     deepest = tip[:, 2] <= tip[:, 2].min() + 1e-9
     width = 1000 * scene.sheet.size[1]
-    figure, (felt, over) = plt.subplots(2, 1, figsize=(6.4, 4.4), sharex=True, layout="constrained")
-    felt.bar(1000 * tip[deepest, 0], np.linalg.norm(force[deepest], axis=1), width=5, color="firebrick")
-    felt.set(ylabel="force 3 mm deep [N]", box_aspect=1 / 3)
+    figure, (force_axes, map_axes) = plt.subplots(2, 1, figsize=(6.4, 4.4), sharex=True, layout="constrained")
+    force_axes.bar(1000 * tip[deepest, 0], np.linalg.norm(force[deepest], axis=1), width=5, color="firebrick")
+    force_axes.set(ylabel="force 3 mm deep [N]", box_aspect=1 / 3)
     with Image.open(SCENES / "textures" / "tumour.png") as stiffness:
         third = stiffness.height // 3
         middle = np.asarray(stiffness)[third:-third]
-        over.imshow(middle, cmap="gray", extent=(-width / 2, width / 2, -width / 6, width / 6))
-    over.plot(1000 * tip[deepest, 0], 1000 * tip[deepest, 1], "o", color="firebrick")
-    over.set(xlabel="place of the tip, from the middle of the sheet [mm]", ylabel="[mm]")
+        map_axes.imshow(middle, cmap="gray", extent=(-width / 2, width / 2, -width / 6, width / 6))
+    map_axes.plot(1000 * tip[deepest, 0], 1000 * tip[deepest, 1], "o", color="firebrick")
+    map_axes.set(xlabel="position of the tip, from the middle of the sheet [mm]", ylabel="[mm]")
     figure.savefig(IMAGES / "palpation.png", dpi=130)
 
 
 def live(name: str, size: int, rate: float, seconds: float) -> None:
-    """Keep a film of a live session with the scene press, which its script presses."""
+    """Record a film of a live session with the scene press and its script."""
     settings = {"render.size": [size, size], "render.supersample": 2, "time.frames_per_second": rate}
     scene = load_scene(SCENES / "press.yaml", settings)
     script = load_script(SCENES / "scripts" / "press.yaml", scene.render.size)
@@ -192,7 +192,7 @@ def live(name: str, size: int, rate: float, seconds: float) -> None:
 
 
 def page(width: int, height: int) -> None:
-    """Keep what Chromium shows of a session with the scene press, whose tissue becomes stiffer under the tool."""
+    """Take a screenshot of a session with the scene press, with a stiffer foundation at the end."""
 
     async def press(session: Session, folder: Path) -> None:
         server = Server(session, listen(0), "scenes/press.yaml")
@@ -221,15 +221,15 @@ def page(width: int, height: int) -> None:
 
 
 def sweep() -> None:
-    """Keep the pictures that the sweep stiffness ends with, smaller."""
+    """Write smaller pictures of the contact sheet and the plot of the sweep stiffness."""
     with tempfile.TemporaryDirectory() as directory:
         if main_of_program(["sweep", str(SCENES / "sweeps" / "stiffness.yaml"), "--out", directory]) != 0:
             raise SystemExit("the sweep failed")
-        # Of the contact sheet two rows.
-        for name, share, kept in (("contact.jpg", 0.34, "sweep-contact.jpg"), ("sweep.png", 1, "sweep-plot.png")):
+        # Two rows of the contact sheet.
+        for name, share, target in (("contact.jpg", 0.34, "sweep-contact.jpg"), ("sweep.png", 1, "sweep-plot.png")):
             with Image.open(Path(directory) / name) as picture:
                 part = picture.convert("RGB").crop((0, 0, picture.width, round(share * picture.height)))
-            part.resize((1400, round(1400 * part.height / part.width))).save(IMAGES / kept, quality=88)
+            part.resize((1400, round(1400 * part.height / part.width))).save(IMAGES / target, quality=88)
 
 
 def data_set(runs: int, moment: float, size: int) -> list[Image.Image]:
@@ -245,7 +245,7 @@ def data_set(runs: int, moment: float, size: int) -> list[Image.Image]:
 
 
 def grid(pictures: list[Image.Image], columns: int, gap: int = 6) -> Image.Image:
-    """Put pictures side by side on white, so many in a row."""
+    """Arrange pictures in rows on white."""
     width, height = pictures[0].size
     rows = -(-len(pictures) // columns)
     page = Image.new("RGB", (columns * (width + gap) - gap, rows * (height + gap) - gap), "white")

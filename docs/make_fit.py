@@ -45,7 +45,7 @@ FIVE = ["tissue.young", "tissue.foundation", "tissue.damping", "probes.0.at.0", 
 
 
 def beef() -> tuple[FitResult, Floats]:
-    """Run the page's code; return its result, and the whole table: time [s], depth [m] and force [N]."""
+    """Run the page's code; return its result, and the complete table: time [s], depth [m] and force [N]."""
     table = np.array(BEEF.split(), np.float64).reshape(-1, 3) - CONTACT
     table[:, 1] /= 1000
     code = (ROOT / "docs" / "fit-indentation.md").read_text(encoding="utf-8").split("```python\n")[1].split("```")[0]
@@ -57,10 +57,10 @@ def beef() -> tuple[FitResult, Floats]:
     return names["found"], table
 
 
-def draw_beef(found: FitResult, table: Floats) -> None:
-    """Draw the forces against depth, and in time, where the model has one force at one depth."""
+def draw_beef(result: FitResult, table: Floats) -> None:
+    """Draw the forces against depth and time; the model has a single force at a depth."""
     times, depth, force = table.T
-    scene = found.scene.model_dump(mode="json", exclude_none=True)
+    scene = result.scene.model_dump(mode="json", exclude_none=True)
     scene["probes"][0]["path"] = [[t, 0.5, 0.5, -d] for t, d in zip(times.tolist(), depth.tolist(), strict=True)]
     scene["time"]["duration"] = float(times[-1])
     model = []
@@ -68,17 +68,17 @@ def draw_beef(found: FitResult, table: Floats) -> None:
         for frame in range(simulation.scene.time.frames + 1):
             simulation.advance(min(frame, 1))
             model.append((simulation.time, -simulation.forces()[0].tip[2], -simulation.forces()[0].force[2]))
-    now, deep, felt = np.array(model).T
-    end = int(np.searchsorted(now, times[STEADY_ROWS - 1] + 1e-6))
+    model_times, model_depth, model_force = np.array(model).T
+    end = int(np.searchsorted(model_times, times[STEADY_ROWS - 1] + 1e-6))
     with plt.style.context(STYLE, after_reset=True):
         figure, (over, held) = plt.subplots(1, 2, figsize=(7.5, 2.9), sharey=True, layout="constrained")
-        over.plot(1000 * deep[:end], felt[:end], color=BLUE, label="fitted")
-        over.plot(1000 * deep[end - 1 :], felt[end - 1 :], "--", color=BLUE, label="predicted")
+        over.plot(1000 * model_depth[:end], model_force[:end], color=BLUE, label="fitted")
+        over.plot(1000 * model_depth[end - 1 :], model_force[end - 1 :], "--", color=BLUE, label="predicted")
         over.plot(1000 * depth, force, "o", color=VERMILION, markersize=3, label="measured")
         over.set(title="Beef, pressed by a ball", xlabel="depth [mm]", ylabel="force [N]")
         over.legend()
-        held.plot(now[:end], felt[:end], color=BLUE)
-        held.plot(now[end - 1 :], felt[end - 1 :], "--", color=BLUE)
+        held.plot(model_times[:end], model_force[:end], color=BLUE)
+        held.plot(model_times[end - 1 :], model_force[end - 1 :], "--", color=BLUE)
         held.plot(times, force, "o", color=VERMILION, markersize=3)
         held.annotate("the tool stands,\nand beef relaxes", (6.5, 0.85))
         held.set(title="The same in time", xlabel="time [s]")
@@ -86,17 +86,17 @@ def draw_beef(found: FitResult, table: Floats) -> None:
         plt.close(figure)
 
 
-def aim(newtons: float, tracks: int, points: int = 41) -> FitResult:
-    """Find five numbers of press.yaml from its tracks with errors, starting from the scene as it is shipped."""
+def fit_press(newtons: float, tracks: int, points: int = 41) -> FitResult:
+    """Fit five parameters of press.yaml to its tracks with errors, from the shipped scene."""
     settings = {"sheet.points": [points, points], "probes.0.total": [0, 0, -newtons], "render.tracks": tracks}
     start = load_scene(ROOT / "scenes" / "press.yaml", {**settings, "output": ["tracks"]})
     assert start.tissue is not None
     truth: Scene = start.model_copy(update={"tissue": start.tissue.model_copy(update={"young": TRUTH})})
     with tempfile.TemporaryDirectory() as directory:
         run(truth, directory, estimate_error=False)
-        with np.load(Path(directory) / "tracks.npz") as seen:
-            pixel = np.where(seen["occluded"][..., None], np.nan, seen["points"].astype(np.float64))
-            coordinates = seen["coordinates"]
+        with np.load(Path(directory) / "tracks.npz") as archive:
+            pixel = np.where(archive["occluded"][..., None], np.nan, archive["points"].astype(np.float64))
+            coordinates = archive["coordinates"]
     pixel += np.random.default_rng(1).normal(0, ERROR, pixel.shape)
     observed = {"time": np.arange(pixel.shape[1]) / 25, "coordinates": coordinates, "pixel": pixel, "sigma": ERROR}
     return fit(start, observed, FIVE)
@@ -104,18 +104,18 @@ def aim(newtons: float, tracks: int, points: int = 41) -> FitResult:
 
 def main() -> None:
     """Write the picture, and print the numbers."""
-    found, table = beef()
-    draw_beef(found, table)
-    print(f"held, {table[-1, 2] / table[:, 2].max():.0%} of the largest force are left")
+    result, table = beef()
+    draw_beef(result, table)
+    print(f"force at the end of the hold: {table[-1, 2] / table[:, 2].max():.0%} of the largest")
     for newtons, tracks in ((2, 16), (2, 32), (6, 16)):
-        begun = time.perf_counter()
-        found = aim(newtons, tracks)
+        start = time.perf_counter()
+        result = fit_press(newtons, tracks)
         errors = [
-            f"{100 * one.standard_error / abs(one.value):.2g} % ({100 * (one.value / truth - 1):+.2g} %)"
-            for one, truth in zip(found.parameters.values(), (TRUTH, 3e5, 6000, 0.5, 0.5), strict=True)
+            f"{100 * estimate.standard_error / abs(estimate.value):.2g} % ({100 * (estimate.value / truth - 1):+.2g} %)"
+            for estimate, truth in zip(result.parameters.values(), (TRUTH, 3e5, 6000, 0.5, 0.5), strict=True)
         ]
-        seconds = time.perf_counter() - begun
-        print(f"| {newtons} N, {tracks} × {tracks} tracks | {' | '.join(errors)} | {found.runs} | {seconds:.0f} s |")
+        seconds = time.perf_counter() - start
+        print(f"| {newtons} N, {tracks} × {tracks} tracks | {' | '.join(errors)} | {result.runs} | {seconds:.0f} s |")
 
 
 if __name__ == "__main__":

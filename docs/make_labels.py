@@ -1,12 +1,10 @@
-"""Make the pictures of labels.md and its lines on flow and on stereo pairs, each checked by what it is for.
+"""Make the pictures of labels.md and its lines on flow and stereo pairs, with the residuals of both.
 
     PYTHONPATH=. python docs/make_labels.py
 
-What frame i + 1 shows where flow leads from a pixel of frame i is what frame i shows there, but for light, which is
-switched off for that. What is left comes from filtering, and beside outlines from pixels that show both sides of them.
-Light is then switched on again, at first without highlights and the lamp's direction, which leaves the tool's shadow.
-
-Where `stereo` leads from a pixel of the left picture is in the same row once OpenCV has rectified both.
+Without light, frame i + 1 warped by flow equals frame i, except for filtering, and for pixels with both sides of an
+outline. With light but without highlights and the lamp's direction, the tool's shadow remains. Corresponding points of
+`stereo` are in the same row after OpenCV's rectification.
 """
 
 from __future__ import annotations
@@ -20,6 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image, ImageDraw
 
+from benchmarks.marked import replace_marked
 from taichi_msm import Flow, Labels, Simulation, load_scene
 from taichi_msm.render.camera import calibration
 
@@ -27,16 +26,15 @@ ROOT = Path(__file__).parent.parent
 PICTURE = ROOT / "docs" / "images" / "labels.jpg"
 PAGE = ROOT / "docs" / "labels.md"
 PAIR_PICTURE = ROOT / "docs" / "images" / "pair.jpg"
-MARKS = "<!-- {}: made by docs/make_labels.py -->\n", "<!-- end of {} -->\n"
 
 # The frame before the fold of grasp.yaml drops, when everything moves.
 SCENE, FRAME = "grasp", 21
 SIZE, GAP, SAMPLES = 300, 6, 3
 
-# How many times differences are shown as large as they are.
-STRONGER = 6
+# Magnification of displayed differences.
+MAGNIFIED = 6
 
-# A stereo pair whose cameras turn towards each other, each with a lens of its own, and its correspondences [px].
+# A stereo pair of converging cameras with different lenses; size and spacing of the correspondences [px].
 LEFT = {
     "intrinsics": {"fx": 540.0, "fy": 539.0, "cx": 243.2, "cy": 237.1},
     "distortion": {"k1": -0.34, "k2": 0.12, "p1": 0.0006, "p2": -0.0004},
@@ -57,14 +55,14 @@ Image8 = NDArray[np.uint8]
 
 
 def warped(later: Image8, flow: Flow) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
-    """Fetch what a later picture shows where flow leads, filtered bilinearly.
+    """Warp a later picture back by flow, with bilinear filtering.
 
     Args:
         later: colours, shape (height, width, 3).
         flow: from the earlier frame to it.
 
     Returns:
-        Colours, shape (height, width, 3); and where they are known: on the sheet, if it is not hidden then.
+        Colours, shape (height, width, 3); and their validity: on the sheet, if it is not hidden later.
     """
     height, width, _ = later.shape
     known = (flow.flow[..., 0] < 1e9) & (flow.occlusion == 0)
@@ -77,8 +75,8 @@ def warped(later: Image8, flow: Flow) -> tuple[NDArray[np.float64], NDArray[np.b
     return upper * (1 - t) + (later[i + 1, j] * (1 - s) + later[i + 1, j + 1] * s) * t, known
 
 
-def left_over(*settings: str) -> float:
-    """Return the mean difference between a frame and the next one, warped, of the scene with some settings [grey]."""
+def warping_residual(*settings: str) -> float:
+    """Return the mean difference between a frame and the next one warped, with some settings [grey]."""
     with Simulation(load_scene(ROOT / "scenes" / f"{SCENE}.yaml", settings)) as simulation:
         simulation.advance(FRAME)
         first, labels = simulation.draw(), simulation.labels()
@@ -88,7 +86,7 @@ def left_over(*settings: str) -> float:
 
 
 def coloured(flow: Flow) -> Image8:
-    """Show directions as hues and lengths as saturation."""
+    """Return flow as colours: directions as hues and lengths as saturation."""
     known = flow.flow[..., 0] < 1e9
     right, down = np.moveaxis(np.where(known[..., None], flow.flow, 0), -1, 0)
     length = np.hypot(right, down) / np.hypot(right, down).max()
@@ -98,33 +96,32 @@ def coloured(flow: Flow) -> Image8:
 
 
 def longest(flow: Flow) -> float:
-    """Give the longest flow [px]."""
+    """Return the length of the longest flow [px]."""
     return float(np.hypot(*np.moveaxis(flow.flow, -1, 0))[flow.flow[..., 0] < 1e9].max())
 
 
 def shades(depth: NDArray[np.float32]) -> Image8:
-    """Show what is nearer as brighter."""
+    """Return depth as grey, brighter for nearer surfaces."""
     near, far = np.percentile(depth[depth > 0], [0.5, 99.5])
     grey = np.where(depth > 0, np.clip(255 * (far - depth) / (far - near), 20, 255), 0)
     return np.repeat(grey.astype(np.uint8)[..., None], 3, axis=-1)
 
 
 def masks(labels: Labels, flow: Flow) -> Image8:
-    """Show the instrument in blue, and what will be hidden in orange."""
-    found = np.full((*flow.occlusion.shape, 3), 40, np.uint8)
-    found[labels.instrument > 0] = (90, 150, 255)
-    found[flow.occlusion > 0] = (255, 150, 40)
-    return found
+    """Return the instrument in blue, and points hidden in the next frame in orange."""
+    picture = np.full((*flow.occlusion.shape, 3), 40, np.uint8)
+    picture[labels.instrument > 0] = (90, 150, 255)
+    picture[flow.occlusion > 0] = (255, 150, 40)
+    return picture
 
 
 def difference(a: NDArray[np.floating], b: Image8, known: NDArray[np.bool_]) -> Image8:
-    """Show a difference where it is known."""
-    apart = np.clip(STRONGER * np.abs(a - b), 0, 255) * known[..., None]
-    return apart.astype(np.uint8)
+    """Return the magnified difference where it is known."""
+    return (np.clip(MAGNIFIED * np.abs(a - b), 0, 255) * known[..., None]).astype(np.uint8)
 
 
 def page(panels: dict[str, Image8]) -> Image.Image:
-    """Put panels in two rows, each with its name."""
+    """Arrange panels in two rows, each with its name."""
     columns = len(panels) // 2
     sheet = Image.new("RGB", (columns * (SIZE + GAP) - GAP, 2 * (SIZE + 22)), "white")
     draw = ImageDraw.Draw(sheet)
@@ -147,7 +144,7 @@ def marked(picture: Image8, points: NDArray[np.float64], *, rows: bool) -> Image
 
 
 def pair() -> str:
-    """Draw a stereo pair with its correspondences, as it is and rectified; return how well these agree."""
+    """Draw a stereo pair with its correspondences, original and rectified; return the text on their agreement."""
     settings: dict[str, Any] = {
         "render.camera": None,
         "render.cameras": {"left": LEFT, "right": RIGHT},
@@ -156,14 +153,14 @@ def pair() -> str:
     }
     with Simulation(load_scene(ROOT / "scenes" / f"{SCENE}.yaml", settings)) as simulation:
         simulation.advance(FRAME)
-        seen = simulation.observe(None, "left")
+        observation = simulation.observe(None, "left")
         pictures = [simulation.draw(name) for name in ("left", "right")]
         cameras = [calibration(simulation.renderer.resolve_camera(name)) for name in ("left", "right")]
-    assert seen.stereo is not None
-    stereo, hidden = seen.stereo.stereo, seen.stereo.stereo_occlusion
+    assert observation.stereo is not None
+    stereo, hidden = observation.stereo.stereo, observation.stereo.stereo_occlusion
     assert stereo is not None
     assert hidden is not None
-    lenses = [(np.array(each["calibration"]), np.array(each["distortion"])) for each in cameras]
+    lenses = [(np.array(camera["calibration"]), np.array(camera["distortion"])) for camera in cameras]
     size, translation = (PAIR_SIZE, PAIR_SIZE), np.array(RIGHT["translation"])[:, None]
     rectified = cv2.stereoRectify(*lenses[0], *lenses[1], size, TURN, translation, alpha=0)
     turns, matrices = rectified[:2], rectified[2:4]
@@ -178,67 +175,66 @@ def pair() -> str:
             for points, lens, turn, matrix in zip(both, lenses, turns, matrices, strict=True)
         ]
 
-    found = [rectify((3, iterations, 1e-9)) for iterations in (100, 5)]
-    apart = [float(np.abs(one[:, 1] - other[:, 1]).max()) for one, other in found]
+    exact, five = (rectify((3, iterations, 1e-9)) for iterations in (100, 5))
+    offsets = [float(np.abs(first[:, 1] - second[:, 1]).max()) for first, second in (exact, five)]
     shown = ((left + SPACING // 2) % SPACING == 0).all(axis=1)
-    shown &= ((found[0][0] > 0) & (found[0][0] < PAIR_SIZE)).all(axis=1)
+    shown &= ((exact[0] > 0) & (exact[0] < PAIR_SIZE)).all(axis=1)
     flat = [
         cv2.remap(picture, *cv2.initUndistortRectifyMap(*lens, turn, matrix, size, cv2.CV_32FC1), cv2.INTER_LINEAR)
         for picture, lens, turn, matrix in zip(pictures, lenses, turns, matrices, strict=True)
     ]
     upper, lower = (
-        np.hstack([marked(each, points[shown], rows=rows) for each, points in zip(drawn, places, strict=True)])
-        for drawn, places, rows in ((pictures, both, False), (flat, found[0], True))
+        np.hstack([marked(picture, points[shown], rows=rows) for picture, points in zip(drawn, pair, strict=True)])
+        for drawn, pair, rows in ((pictures, both, False), (flat, exact, True))
     )
     Image.fromarray(np.vstack([upper, np.full((GAP, 2 * PAIR_SIZE, 3), 255, np.uint8), lower])).save(
         PAIR_PICTURE, quality=88
     )
     return (
         "In the picture, corresponding points of the rectified pictures are in the same row to\n"
-        f"{apart[0]:.4f} px. Without `criteria`, after OpenCV's five iterations, they are up to {apart[1]:.2f} px\n"
+        f"{offsets[0]:.4f} px. Without `criteria`, after OpenCV's five iterations, they are up to {offsets[1]:.2f} px\n"
         "apart, and more where lenses distort more. (`docs/make_labels.py` makes the picture and these lines.)\n"
     )
 
 
 def main() -> None:
-    """Write the pictures, and to the page what is left after warping and rectifying."""
+    """Write the pictures, and the residuals of warping and rectification to the page."""
     settings = [f"render.size=[{SIZE},{SIZE}]", f"render.supersample={SAMPLES}"]
     lit = load_scene(ROOT / "scenes" / f"{SCENE}.yaml", settings)
     plain = load_scene(ROOT / "scenes" / f"{SCENE}.yaml", [*settings, "render.shading=none"])
     with Simulation(lit) as simulation, Simulation(plain) as unlit:
-        for one in (simulation, unlit):
-            one.advance(FRAME)
+        for each in (simulation, unlit):
+            each.advance(FRAME)
         picture, labels, first = simulation.draw(), simulation.labels(), unlit.draw()
-        for one in (simulation, unlit):
-            one.advance()
+        for each in (simulation, unlit):
+            each.advance()
         flow, second = simulation.flow(labels), unlit.draw()
     back, known = warped(second, flow)
-    before, after = (np.abs(one.astype(float) - first)[known].mean() for one in (second, back))
+    before, after = (np.abs(picture.astype(float) - first)[known].mean() for picture in (second, back))
     dull, even = "render.light.gloss=0", "render.light.ambient=1"
-    whole, matt, shadow = (left_over(*settings, *off) for off in ([], [dull], [dull, even]))
+    lit_left, matt, shadow = (warping_residual(*settings, *off) for off in ([], [dull], [dull, even]))
     panels = {
         f"frame {FRAME}": picture,
         "depth, light is near": shades(labels.depth),
         f"flow, up to {longest(flow):.0f} px": coloured(flow),
-        f"difference from frame {FRAME + 1} x {STRONGER}": difference(second.astype(float), first, known),
-        f"the same x {STRONGER}, warped by flow": difference(back, first, known),
+        f"difference from frame {FRAME + 1} x {MAGNIFIED}": difference(second.astype(float), first, known),
+        f"the same x {MAGNIFIED}, warped by flow": difference(back, first, known),
         "blue: instrument; orange: then hidden": masks(labels, flow),
     }
     page(panels).save(PICTURE, quality=92)
-    said = (
+    warping = (
         f"The top picture shows it: frame {FRAME} of `{SCENE}.yaml` and the next, drawn without light at\n"
         f"{SIZE} × {SIZE} pixels of {SAMPLES} × {SAMPLES} samples, differ by {before:.2f} grey levels on average\n"
         f"where the next one shows the same; fetched from where flow leads, by {after:.2f}, due to filtering.\n"
-        f"Lit frames differ by {whole:.2f} then. Light is not carried along by the tissue: how bright a point is\n"
+        f"Lit frames differ by {lit_left:.2f} then. Light is not carried along by the tissue: how bright a point is\n"
         "depends on how it is turned to the lamp and how near it is, the tool's shadow moves over it, and highlights\n"
         f"change with the line of sight. {matt:.2f} are left without highlights (`light.gloss: 0`), and {shadow:.2f}\n"
         "if light comes from everywhere, too (`light.ambient: 1`): the shadow, and filtering. To compare frames by\n"
         "their colours, draw them with `shading: none`. (`docs/make_labels.py` makes the picture and these lines.)\n"
     )
-    for name, lines in (("warping", said), ("pair", pair())):
-        start, end = (mark.format(name) for mark in MARKS)
-        begin, rest = PAGE.read_text(encoding="utf-8").split(start)
-        PAGE.write_text(begin + start + lines + end + rest.split(end)[1], encoding="utf-8")
+    for name, lines in (("warping", warping), ("pair", pair())):
+        text = PAGE.read_text(encoding="utf-8")
+        PAGE.write_text(replace_marked(text, name, "docs/make_labels.py", lines), encoding="utf-8")
         print(lines, end="")
 
 

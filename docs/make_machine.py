@@ -4,8 +4,8 @@
     python docs/make_machine.py WORKBOOK STRIP --draw SHEET
     python docs/make_machine.py WORKBOOK STRIP --draw-scenes
 
-The files are those named on the page; strips are skin or mucosa by their names. A fit that is already in
-docs/machine-fits.json is kept, so that the script continues where it was interrupted: delete the file to repeat all.
+The page names the files; strips are skin or mucosa by their names. Fits in docs/machine-fits.json are kept, so that an
+interrupted script continues: delete the file to repeat all.
 With --draw it fits a strip and a sheet again, and draws them. With --draw-scenes it draws scenes/beef.yaml and
 scenes/skin.yaml over their tests. Takes about half a minute of a core per test.
 """
@@ -100,9 +100,9 @@ def fit_strip(path: str) -> FitResult:
 
 
 def summarise(result: FitResult) -> dict[str, Any]:
-    """Return the numbers of a fit for the record."""
+    """Return a fit as an entry of the record."""
     (test,) = result.tests
-    parameters = {key: [each.value, *each.interval] for key, each in result.parameters.items()}
+    parameters = {key: [estimate.value, *estimate.interval] for key, estimate in result.parameters.items()}
     # The branch with the shorter time is the first.
     branch = "tissue.relaxation.{}.{}"
     if (
@@ -115,7 +115,7 @@ def summarise(result: FitResult) -> dict[str, Any]:
     difference = np.abs(test.force - test.loading.force) / test.loading.peak
     return {
         "parameters": parameters,
-        "not_identifiable": [key for key, each in result.parameters.items() if not each.identifiable],
+        "not_identifiable": [key for key, estimate in result.parameters.items() if not estimate.identifiable],
         "peak": test.loading.peak,
         "rms": test.residual / test.loading.peak,
         "largest": float(difference.max()),
@@ -140,7 +140,7 @@ def table(record: dict[str, Any], keys: dict[str, tuple[str, float]]) -> list[st
 
 
 def _cell(numbers: dict[str, Any], key: str, scale: float) -> str:
-    """Format a value with its interval; an end beyond a bound is left open."""
+    """Format a value with its interval; an end beyond a bound stays open."""
     if key in numbers["not_identifiable"]:
         return "not identifiable"
     value, low, high = (None if number is None else scale * number for number in numbers["parameters"][key])
@@ -187,7 +187,7 @@ def draw(pressed: FitResult, pulled: FitResult) -> None:
 
 
 def simulate(name: str) -> np.ndarray:
-    """Return time [s], place of the tip [m] and force [N] of a shipped scene's tool, shape (frames + 1, 7)."""
+    """Return time [s], position of the tip [m] and force [N] of a shipped scene's tool, shape (frames + 1, 7)."""
     rows = []
     with Simulation(load_scene(DOCS.parent / "scenes" / f"{name}.yaml", {"output": []})) as simulation:
         for frame in range(simulation.scene.time.frames + 1):

@@ -1,4 +1,4 @@
-"""Find a lump in tissue that is pulled, and measure how well a map is found, for the page on fits.
+"""Estimate a lump in pulled tissue, and measure the accuracy of estimated maps, for the page on fits.
 
     python docs/make_map.py
 
@@ -28,28 +28,28 @@ Floats = NDArray[np.float64]
 ROOT = Path(__file__).parent.parent
 IMAGES = ROOT / "docs" / "images"
 
-# Eight tools that stick to the surface, around its middle.
-PLACES = [(x, y) for y in (0.2, 0.5, 0.8) for x in (0.2, 0.5, 0.8) if (x, y) != (0.5, 0.5)]
+# Positions of eight tools that stick to the surface, around its middle.
+POSITIONS = [(x, y) for y in (0.2, 0.5, 0.8) for x in (0.2, 0.5, 0.8) if (x, y) != (0.5, 0.5)]
 
 RESOLUTION = 16
 
 
 def directions() -> Floats:
-    """Give where the tools pull, across and down, shape (8, 8, 2): in every picture each tool.
+    """Return the directions of pull, across and down, of each tool in each picture, shape (8, 8, 2).
 
-    They pull all to the right, all down, to the right and down by turns, to the right and up by turns; outward, around
-    the middle, and both again, every other tool the other way.
+    All to the right; all down; alternately to the right and down; alternately to the right and up; outward; around the
+    middle; and the last two with every second tool reversed.
     """
-    turns, right, down = np.arange(8)[:, None] % 2, np.array([[1, 0]] * 8), np.array([[0, 1]] * 8)
-    outward = np.array(PLACES) - 0.5
+    odd, right, down = np.arange(8)[:, None] % 2, np.array([[1, 0]] * 8), np.array([[0, 1]] * 8)
+    outward = np.array(POSITIONS) - 0.5
     outward /= np.linalg.norm(outward, axis=1, keepdims=True)
-    around, other = outward[:, ::-1] * (-1, 1), 1 - 2 * turns
-    alike = [right, down, np.where(turns, down, right), np.where(turns, -down, right)]
-    return np.array([*alike, outward, around, outward * other, around * other])
+    around, sign = outward[:, ::-1] * (-1, 1), 1 - 2 * odd
+    uniform = [right, down, np.where(odd, down, right), np.where(odd, -down, right)]
+    return np.array([*uniform, outward, around, outward * sign, around * sign])
 
 
 def pulled(newtons: float) -> list[dict[str, Any]]:
-    """Make the tools: a probe for each of their two directions."""
+    """Return the tools: a probe for each of their two directions."""
     shares = directions()
     return [
         {
@@ -59,13 +59,13 @@ def pulled(newtons: float) -> list[dict[str, Any]]:
             "radius": 0.008,
             "falloff": 150,
         }
-        for n, at in enumerate(PLACES)
+        for n, at in enumerate(POSITIONS)
         for axis, total in enumerate(((newtons, 0, 0), (0, -newtons, 0)))
     ]
 
 
 def scene_of(points: int, **more: Any) -> Scene:
-    """Take the tissue of scenes/tumour.yaml, on a softer ground, with these tools and a camera above it."""
+    """Return scenes/tumour.yaml on a softer foundation, with these tools and a camera above it."""
     return load_scene(
         ROOT / "scenes" / "tumour.yaml",
         {
@@ -82,27 +82,27 @@ def scene_of(points: int, **more: Any) -> Scene:
     )
 
 
-def found(truth: Scene, error: float) -> FitResult:
-    """Find the map of a truth with twice as many points a side, from its tracks with errors [px]."""
+def fit_map(truth: Scene, error: float) -> FitResult:
+    """Fit the map to tracks with errors [px] of a truth with twice the points per side."""
     with tempfile.TemporaryDirectory() as directory:
         run(truth, directory, estimate_error=False)
-        with np.load(Path(directory) / "tracks.npz") as seen:
-            pixel, coordinates = seen["points"].astype(np.float64)[:, 1:], seen["coordinates"]
+        with np.load(Path(directory) / "tracks.npz") as archive:
+            pixel, coordinates = archive["points"].astype(np.float64)[:, 1:], archive["coordinates"]
     pixel += np.random.default_rng(1).normal(0, error, pixel.shape)
     observed = {"time": np.arange(1, 9), "coordinates": coordinates, "pixel": pixel, "sigma": error}
     return fit(scene_of(31, **{"tissue.map": None}), observed, ["tissue.map"], resolution=RESOLUTION)
 
 
 def factors(scene: Scene) -> Floats:
-    """Give the true factors at the centres of the fields."""
+    """Return the true factors at the centres of the cells."""
     assert scene.tissue is not None
     assert scene.tissue.map is not None
-    places = centres(RESOLUTION)
-    return map_factors(scene.tissue.map, read_map(scene.tissue.map), places, places)
+    at = centres(RESOLUTION)
+    return map_factors(scene.tissue.map, read_map(scene.tissue.map), at, at)
 
 
 def draw(truth: Scene, result: FitResult) -> None:
-    """Draw the truth, what was found, and its errors."""
+    """Draw the truth, the estimate, and its errors."""
     assert result.map is not None
     both, errors = LogNorm(0.7, 2.2), 100 * result.map.errors
     with plt.style.context(STYLE, after_reset=True):
@@ -125,32 +125,32 @@ def draw(truth: Scene, result: FitResult) -> None:
         plt.close(figure)
 
 
-def in_fields(truth: Scene, directory: Path) -> Scene:
-    """Give the truth a map that has as few fields as the one that is found."""
+def coarse_truth(truth: Scene, directory: Path) -> Scene:
+    """Return the truth with a map of the estimate's resolution."""
     grey = np.round(65535 * (factors(truth) - 1)).astype(np.uint16)
     Image.fromarray(grey).save(directory / "fields.png")
     assert truth.tissue is not None
-    own = StiffnessMap(image=str(directory / "fields.png"), range=(1, 2))
-    return truth.model_copy(update={"tissue": truth.tissue.model_copy(update={"map": own})})
+    coarse = StiffnessMap(image=str(directory / "fields.png"), range=(1, 2))
+    return truth.model_copy(update={"tissue": truth.tissue.model_copy(update={"map": coarse})})
 
 
 def main() -> None:
     """Write the picture, and print the numbers."""
     truth = scene_of(61, **{"tissue.map.range": [1, 2]})
-    result = found(truth, 1.0)
+    result = fit_map(truth, 1.0)
     draw(truth, result)
     print("\n".join(result.summary()))
     with tempfile.TemporaryDirectory() as directory:
-        fields = in_fields(truth, Path(directory))
+        coarse = coarse_truth(truth, Path(directory))
         for error in (1.0, 0.1, 0.02):
-            result = found(fields, error)
+            result = fit_map(coarse, error)
             assert result.map is not None
-            known, off = ~result.map.unknown, np.abs(result.map.factors / factors(fields) - 1)
-            errors = [f"{100 * one:.2g} %" for one in np.quantile(off[known], (0.5, 0.95))]
-            told = 100 * np.median(result.map.errors[known])
-            within, seconds = (off[known] < 0.05).mean(), result.seconds
+            known, error_of = ~result.map.unknown, np.abs(result.map.factors / factors(coarse) - 1)
+            errors = [f"{100 * quantile:.2g} %" for quantile in np.quantile(error_of[known], (0.5, 0.95))]
+            standard_error = 100 * np.median(result.map.errors[known])
+            within, seconds = (error_of[known] < 0.05).mean(), result.seconds
             print(
-                f"| {error:g} px | {known.sum()} | {told:.2g} % | {' | '.join(errors)} | {within:.0%} "
+                f"| {error:g} px | {known.sum()} | {standard_error:.2g} % | {' | '.join(errors)} | {within:.0%} "
                 f"| {result.map.range[1]:.3g} | {result.runs} | {seconds:.0f} s |",
                 flush=True,
             )

@@ -1,8 +1,8 @@
-"""Write docs/numerics.md and its pictures: what the program computes beside independent solutions.
+"""Write docs/numerics.md and its pictures: results of the program against independent solutions.
 
     PYTHONPATH=. python docs/make_numerics.py
 
-It takes some minutes; nothing in it is timed.
+Takes some minutes; nothing is timed.
 """
 
 from __future__ import annotations
@@ -17,13 +17,13 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 from scipy.optimize import brentq
-from scipy.sparse import coo_matrix, csc_matrix, identity
+from scipy.sparse import csc_array
 from scipy.sparse.linalg import eigsh, spsolve
 from scipy.special import k0, k1
 
 from taichi_msm import Scene, load_scene
 from taichi_msm.accuracy.time_step import TimeStepTrials, max_norm
-from taichi_msm.model.loads import decay, evaluate_loads
+from taichi_msm.model.loads import evaluate_loads
 from taichi_msm.model.plan import Plan
 from taichi_msm.model.sheet import fixed_points, rest_positions, spacing
 from taichi_msm.model.time_grid import Precision
@@ -34,6 +34,7 @@ from taichi_msm.solver.rest import QuasiStatics
 from taichi_msm.solver.state import State
 from taichi_msm.study.format import markdown_table
 from taichi_msm.system import runtime
+from tests import reference
 
 ROOT = Path(__file__).parent.parent
 PAGE, TEMPLATE = ROOT / "docs" / "numerics.md", ROOT / "docs" / "numerics.template"
@@ -46,49 +47,46 @@ BUCKLING = 5
 ENERGY_STEPS = 100_000
 MODES = 6
 
-# How close to the sheet at rest a stepped one must come, of the largest displacement; it is compared every few steps.
-CLOSE, STRIDE = 1e-6, 16
+# Distance of a stepped sheet from equilibrium, relative to the largest displacement.
+CLOSE = 1e-6
 
-# The points a side of the sheets that a round tip is pressed into.
+# Points per side of the indented sheets.
 INDENTED = (61, 121, 241)
-
-# Springs of which every one is counted once: down, right.
-HALF = ((0, 1), (1, 0), (1, 1), (1, -1))
 
 
 def press(*overrides: str) -> Scene:
-    """Load the press in springs."""
+    """Load the press of springs."""
     return load_scene(ROOT / "docs" / "springs.yaml", ["output=[]", *overrides])
 
 
 def stiffer(times: int) -> Scene:
-    """Make the springs of the press stiffer, but not the virtual ones."""
+    """Return the press with stiffer springs and the same virtual ones."""
     sheet = make_plan(press()).material
     return press(f"springs.structural={times * sheet.across}", f"springs.shear={times * sheet.shear}")
 
 
 def motion(plan: Plan) -> Array:
-    """Displacements of every frame but the first, as they are written."""
+    """Return the displacements of every frame but the first, with the rounding of the trajectory."""
     dynamics = Dynamics(plan, runtime.current_device())
     rest, frames = rest_positions(plan.scene.sheet), []
     for _ in range(plan.grid.frames):
         dynamics.advance(plan.grid.steps_per_frame)
         u = dynamics.displacement()
-        # In f32 the trajectory has positions.
+        # The trajectory of f32 has positions.
         frames.append((rest + u).astype(u.dtype) - rest)
     dynamics.close()
     return np.array(frames)
 
 
 def truth(plan: Plan) -> Array:
-    """Extrapolate in float64, from displacements."""
+    """Extrapolate displacements in float64 to a step of 0."""
     counts = (n * plan.grid.steps_per_frame for n in (8, 16))
     coarse, fine = (motion(plan.with_grid(steps_per_frame=count, precision="f64")) for count in counts)
     return fine + (fine - coarse) / 3
 
 
 def silent_table() -> str:
-    """Compare f32, the precision of `auto`, and the error that is told."""
+    """Table of the errors in f32 and with `auto`, and of the estimated error."""
     faint = load_scene(ROOT / "tests" / "hard" / "faint.yaml")
     cases = {f"springs {times} × as stiff": stiffer(times) for times in STIFFER}
     cases |= {"`faint`, displacements of 10 nm": faint}
@@ -97,70 +95,28 @@ def silent_table() -> str:
         plan = make_plan(scene)
         exact = truth(plan)
         largest = max_norm(exact)
-        errors = [max_norm(motion(one) - exact) / largest for one in (plan.with_grid(precision="f32"), plan)]
-        told = TimeStepTrials(plan, runtime.current_device()).estimate(plan.grid.steps_per_frame).error
-        rows.append([name, *(f"{error:.2g}" for error in errors), f"{told:.2g}", plan.grid.precision])
+        errors = [max_norm(motion(each) - exact) / largest for each in (plan.with_grid(precision="f32"), plan)]
+        estimate = TimeStepTrials(plan, runtime.current_device()).estimate(plan.grid.steps_per_frame).error
+        rows.append([name, *(f"{error:.2g}" for error in errors), f"{estimate:.2g}", plan.grid.precision])
     return markdown_table(
-        ["run", "error in f32", "error with auto", "error told", "auto takes"], rows, left_columns=(0, 4)
+        ["run", "error in f32", "error with auto", "estimated error", "auto takes"], rows, left_columns=(0, 4)
     )
 
 
-def stiffness(scene: Scene, displacement: Array, active: float) -> csc_matrix:
-    """Assemble the second derivative of the energy over the coordinates of all points that move [N/m].
-
-    The scene is in springs, so that K is the same at all points. A spring of direction n and lengths L and L0 adds
-    k ((1 - L0 / L) (I - n n^T) + n n^T) between its ends.
-    """
-    rows, cols = scene.sheet.points
-    dx, dy = spacing(scene.sheet)
-    x = rest_positions(scene.sheet) + displacement
-    number = np.arange(rows * cols).reshape(rows, cols)
-    parts = []
-    for down, right in HALF:
-        k = make_plan(scene).material.shear if down and right else make_plan(scene).material.across
-        here = np.s_[0 : rows - down, max(0, -right) : cols - max(0, right)]
-        there = np.s_[down:rows, max(0, right) : cols + min(0, right)]
-        along = x[there] - x[here]
-        length = np.linalg.norm(along, axis=-1)[..., None, None]
-        n = (along / length[..., 0])[..., :, None]
-        project = n * np.swapaxes(n, -1, -2)
-        block = k * ((1 - math.hypot(right * dx, down * dy) / length) * (np.eye(3) - project) + project)
-        a, b = number[here].ravel(), number[there].ravel()
-        blocks = block.reshape(-1, 3, 3)
-        parts += [(a, a, blocks), (b, b, blocks), (a, b, -blocks), (b, a, -blocks)]
-    size = 3 * rows * cols
-    first = np.concatenate([np.repeat(3 * i[:, None] + np.arange(3), 3, axis=1).ravel() for i, _, _ in parts])
-    second = np.concatenate([np.tile(3 * j[:, None] + np.arange(3), (1, 3)).ravel() for _, j, _ in parts])
-    values = np.concatenate([blocks.ravel() for _, _, blocks in parts])
-    whole = coo_matrix((values, (first, second)), shape=(size, size)).tocsc()
-    whole = whole + active * make_plan(scene).material.virtual * identity(size, format="csc")
+def stiffness(scene: Scene, displacement: Array, active: float) -> csc_array:
+    """Return the second derivatives of the energy by the coordinates of all points that move [N/m]."""
     moves = np.repeat(~fixed_points(scene.sheet).ravel(), 3)
-    return whole[moves][:, moves]
+    return reference.stiffness(scene, displacement, active)[moves][:, moves]
 
 
 def forces(scene: Scene, displacement: Array, t: float) -> Array:
-    """Sum up springs, virtual springs and probes on the points that move [N], by the same list of springs."""
-    rows, cols = scene.sheet.points
-    dx, dy = spacing(scene.sheet)
-    x, total = rest_positions(scene.sheet) + displacement, np.zeros((rows, cols, 3))
-    for down, right in HALF:
-        k = make_plan(scene).material.shear if down and right else make_plan(scene).material.across
-        here = np.s_[0 : rows - down, max(0, -right) : cols - max(0, right)]
-        there = np.s_[down:rows, max(0, right) : cols + min(0, right)]
-        along = x[there] - x[here]
-        length = np.linalg.norm(along, axis=-1, keepdims=True)
-        pull = k * (1 - math.hypot(right * dx, down * dy) / length) * along
-        total[here] += pull
-        total[there] -= pull
+    """Return the forces on the points that move at a time [s] without damping [N], flat."""
     loads = evaluate_loads(make_plan(scene), np.array([t]))
-    total -= loads.active[0] * make_plan(scene).material.virtual * displacement
-    for n, probe in enumerate(scene.probes):
-        total += decay(probe, scene.sheet)[..., None] * loads.strength[0, n]
-    return total[~fixed_points(scene.sheet)].ravel()
+    return reference.force(scene, displacement, loads, 0)[~fixed_points(scene.sheet)].ravel()
 
 
-def lowest(matrix: csc_matrix, below: float, count: int = 1) -> tuple[Array, Array]:
-    """Find the smallest eigenvalues and their vectors, near a number that is below all of them."""
+def lowest(matrix: csc_array, below: float, count: int = 1) -> tuple[Array, Array]:
+    """Return the smallest eigenvalues and their vectors; `below` is a lower bound."""
     values, vectors = eigsh(matrix, k=count, sigma=below, which="LM", tol=1e-9)
     assert values.min() > below
     order = np.argsort(values)
@@ -168,7 +124,7 @@ def lowest(matrix: csc_matrix, below: float, count: int = 1) -> tuple[Array, Arr
 
 
 def buckling() -> dict[str, Any]:
-    """Follow the smallest eigenvalue through a stiffer press, and draw it and its mode."""
+    """Compute and draw the smallest eigenvalue during a stiffer press, and its mode."""
     scene = stiffer(BUCKLING)
     plan = make_plan(scene).with_grid(precision="f64")
     grid, dynamics = plan.grid, Dynamics(plan, runtime.current_device())
@@ -209,18 +165,17 @@ def buckling() -> dict[str, Any]:
         mode = modes[worst]
         middle.imshow(np.linalg.norm(mode, axis=-1), cmap="magma")
         middle.set(title=f"Its mode at {times[worst]:g} s: size", xticks=[], yticks=[])
-        near = np.s_[max(0, row - 10) : row + 11]
         column = int(np.abs(along).argmax())
-        beside = np.s_[max(0, column - 10) : column + 11]
+        window = np.s_[max(0, row - 10) : row + 11, max(0, column - 10) : column + 11]
         largest = np.abs(mode[..., component]).max()
-        right.imshow(mode[near, beside, component], cmap="RdBu", vmin=-largest, vmax=largest)
+        right.imshow(mode[..., component][window], cmap="RdBu", vmin=-largest, vmax=largest)
         right.set(title=f"and {'xyz'[component]}, around its largest point", xticks=[], yticks=[])
         figure.savefig(IMAGES / "numerics-buckling.png", format="png")
     return {"buckled": f"{values[worst]:.2g}", "unloaded": f"{values[0]:.2g}"}
 
 
 def energy() -> dict[str, Any]:
-    """Read the energy of an undamped sheet over many steps, and draw it."""
+    """Measure and draw the energy of an undamped sheet over many steps."""
     press_time, every, rows = 0.2, 20, []
     scene = load_scene(ROOT / "tests" / "hard" / "undamped.yaml", [f"time.duration={ENERGY_STEPS}"])
     assert scene.springs is not None
@@ -238,20 +193,20 @@ def energy() -> dict[str, Any]:
         colours: dict[Precision, str] = {"f32": VERMILION, "f64": BLUE}
         for kind, colour in colours.items():
             dynamics = Dynamics(make_plan(made).with_grid(precision=kind), runtime.current_device())
-            found = []
+            energies = []
             for _ in range(ENERGY_STEPS // every):
                 dynamics.advance(every)
-                found.append(dynamics.read().energy)
+                energies.append(dynamics.read().energy)
             dynamics.close()
-            steps = every * np.arange(1, len(found) + 1)
+            steps = every * np.arange(1, len(energies) + 1)
             free = steps * h > press_time + every * h
-            known = np.array(found)[free]
-            mean = known.mean()
-            tenth = len(known) // 10
-            drift = known[-tenth:].mean() / known[:tenth].mean() - 1
-            swing = np.abs(known / mean - 1).max()
+            released = np.array(energies)[free]
+            mean = released.mean()
+            tenth = len(released) // 10
+            drift = released[-tenth:].mean() / released[:tenth].mean() - 1
+            swing = np.abs(released / mean - 1).max()
             rows.append([kind, f"{mean:.4g} J", f"{100 * swing:.2g} %", f"{100 * drift:+.1g} %"])
-            axes.plot(steps[free], known / mean, color=colour, linewidth=0.8, label=kind)
+            axes.plot(steps[free], released / mean, color=colour, linewidth=0.8, label=kind)
         axes.set(
             xlabel="steps", ylabel="energy / its mean", title=f"Energy of an undamped sheet, read every {every} steps"
         )
@@ -271,7 +226,7 @@ def energy() -> dict[str, Any]:
 
 
 def static() -> dict[str, Any]:
-    """Compare the shape at rest under load with Newton's."""
+    """Compare the settled shape under a load with Newton's method."""
     seconds = 6
     scene = press(
         "probes.0.load=[[0, 0], [0.36, 100]]", f"time.duration={seconds}", "damping=0.04", "time.precision=f64"
@@ -282,7 +237,7 @@ def static() -> dict[str, Any]:
     stepped = dynamics.displacement()
     dynamics.close()
     moves = ~fixed_points(scene.sheet)
-    # From nearby, as Newton's method needs, but not from the answer.
+    # Newton's method needs a start nearby, but not the answer.
     u = 0.97 * stepped
     for _ in range(60):
         residual = forces(scene, u, float(seconds))
@@ -296,7 +251,7 @@ def static() -> dict[str, Any]:
 
 
 def at_rest() -> dict[str, Any]:
-    """Count the evaluations of the forces that `motion: quasistatic` takes, and the steps to the same shape."""
+    """Count force evaluations of `motion: quasistatic`, and steps to the same shape."""
     press, sides = "scenes/press.yaml", (31, 61, 121)
     held = ["probes.0.load=[[0, 100]]", "output=[]", "time.duration=1", "time.frames_per_second=100"]
     changes = {
@@ -309,17 +264,17 @@ def at_rest() -> dict[str, Any]:
         counts = [name]
         for side in sides:
             points = f"sheet.points=[{side}, {side}]"
-            found = load_scene(ROOT / press, [*held, *change, points, "time.motion=quasistatic"])
-            still = QuasiStatics(make_plan(found), runtime.current_device())
+            scene = load_scene(ROOT / press, [*held, *change, points, "time.motion=quasistatic"])
+            still = QuasiStatics(make_plan(scene), runtime.current_device())
             still.advance(0)
             counts.append(f"{still.evaluations}")
             if not change:
                 moving = Dynamics(
                     make_plan(load_scene(ROOT / press, [*held, points, "time.precision=f64"])), runtime.current_device()
                 )
-                wanted = still.displacement()
-                while max_norm(moving.displacement() - wanted) > CLOSE * max_norm(wanted):
-                    moving.advance(STRIDE)
+                settled = still.displacement()
+                while max_norm(moving.displacement() - settled) > CLOSE * max_norm(settled):
+                    moving.advance(16)
                 counts[-1] += f" ({moving.steps_done} steps)"
                 moving.close()
             if side == sides[0] and name.startswith("pulled"):
@@ -331,7 +286,7 @@ def at_rest() -> dict[str, Any]:
 
 
 def indentation() -> dict[str, Any]:
-    """Press a round tip into a membrane on a foundation, at rest, and compare its force with the closed form."""
+    """Compare the force of a round tip in a membrane on a foundation, in equilibrium, with the closed form."""
     tension, foundation, radius, depths = 25.0, 4e5, 0.04, (1e-4, 2e-4, 4e-4)
     fades, count = math.sqrt(tension / foundation), len(depths)
     rod = {"radius": radius, "shaft": [0, 0, 1], "length": 0.1}
@@ -359,9 +314,15 @@ def indentation() -> dict[str, Any]:
 
 
 def resistance(depth: float, radius: float, tension: float, foundation: float) -> float:
-    """Give the force of a round tip on an endless membrane on a foundation [N].
+    """Return the force of a round tip on an infinite membrane on a foundation [N].
 
-    S w'' = K w, so that w is K0(r / l), l^2 = S / K, outside of the circle that touches, and a paraboloid within.
+    S w'' = K w, so that w is K0(r / l), l^2 = S / K, outside the contact circle, and a paraboloid inside.
+
+    Args:
+        depth: depth of the tip [m].
+        radius: radius of the tip [m].
+        tension: S [N/m].
+        foundation: K [N/m3].
     """
     fades = math.sqrt(tension / foundation)
 
@@ -374,7 +335,7 @@ def resistance(depth: float, radius: float, tension: float, foundation: float) -
 
 
 def frequencies() -> dict[str, Any]:
-    """Compare the phase of small motions with that of the modes."""
+    """Compare small motions with the phases of their modes."""
     scene = press("springs.virtual_active=always", "damping=0", "time.precision=f64", "probes=[]", "time.duration=0.8")
     plan = make_plan(scene)
     moves, grid = ~plan.fixed, plan.grid
@@ -386,14 +347,15 @@ def frequencies() -> dict[str, Any]:
         theta = 2 * math.asin(w * grid.step / 2)
         shape = np.zeros((*scene.sheet.points, 3))
         shape[moves] = 1e-6 * spacing(scene.sheet)[0] * vector.reshape(-1, 3) / np.abs(vector).max()
-        # Of u_n = cos(n theta) that is u_0, and the difference from u_{-1}. A first step from rest would be another.
+        # u_0 of u_n = cos(n theta), and the difference from u_{-1}; a first step from rest would differ.
         dynamics.restart(plan, State(1, shape, shape * (1 - math.cos(theta))))
         dynamics.advance(grid.steps)
-        found = float((dynamics.displacement() * shape).sum() / (shape * shape).sum())
+        amplitude = float((dynamics.displacement() * shape).sum() / (shape * shape).sum())
         expected = math.cos(grid.steps * theta)
-        rows.append([f"{w / (2 * math.pi):.4f}", f"{expected:+.9f}", f"{found:+.9f}", f"{abs(found - expected):.0e}"])
+        error = f"{abs(amplitude - expected):.0e}"
+        rows.append([f"{w / (2 * math.pi):.4f}", f"{expected:+.9f}", f"{amplitude:+.9f}", error])
     dynamics.close()
-    head = ["frequency [Hz]", "cos(n theta)", "amplitude after n steps", "apart"]
+    head = ["frequency [Hz]", "cos(n theta)", "amplitude after n steps", "difference"]
     return {"modes": MODES, "modes_table": markdown_table(head, rows)}
 
 

@@ -1,6 +1,6 @@
-"""Write the tables that come from the program's own words into the pages: keys, camera files.
+"""Write the tables of keys and camera files into the pages, from the program's descriptions.
 
-python docs/make_tables.py
+PYTHONPATH=. python docs/make_tables.py
 """
 
 from __future__ import annotations
@@ -11,6 +11,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+from benchmarks.marked import replace_marked
 from taichi_msm.camera_files.calibration import CalibrationReader
 from taichi_msm.camera_files.readers import CALIBRATION_READERS, TRAJECTORY_READERS
 from taichi_msm.camera_files.trajectory import TrajectoryReader
@@ -20,11 +21,10 @@ from taichi_msm.sweeps.spec import Distribution, SweepSettings
 from taichi_msm.view.events import KEYS, POINTER
 
 DOCS = Path(__file__).parent
-MARKS = "<!-- {}: made by docs/make_tables.py -->\n", "<!-- end of {} -->\n"
 
 
 def rows(section: dict[str, Any], definitions: dict[str, Any], prefix: str = "") -> Iterator[str]:
-    """Give a line for every key of a section and of the sections below it."""
+    """Yield a line for every key of a section and of its subsections."""
     for name, key in section["properties"].items():
         below = list(_references(key))
         default = f"`{json.dumps(key['default'])}`" if key.get("default") is not None else ""
@@ -38,26 +38,26 @@ def rows(section: dict[str, Any], definitions: dict[str, Any], prefix: str = "")
 
 
 def _references(key: dict[str, Any]) -> Iterator[str]:
-    for place in (key, key.get("items", {}), *key.get("anyOf", ())):
-        if "$ref" in place:
-            yield place["$ref"].rsplit("/", 1)[-1]
+    for schema_part in (key, key.get("items", {}), *key.get("anyOf", ())):
+        if "$ref" in schema_part:
+            yield schema_part["$ref"].rsplit("/", 1)[-1]
 
 
 def scene_keys() -> str:
-    """Give the table of a scene's keys, from its JSON Schema."""
-    whole = schema()
-    return "| key | meaning | value | default |\n|---|---|---|---|\n" + "\n".join(rows(whole, whole["$defs"])) + "\n"
+    """Return the table of a scene's keys, from its JSON Schema."""
+    root = schema()
+    return "| key | meaning | value | default |\n|---|---|---|---|\n" + "\n".join(rows(root, root["$defs"])) + "\n"
 
 
 def page_keys() -> str:
-    """Give the table of what the pointer and the keys do on the page of a session."""
-    lines = [f"| {name} | {does} |" for name, does in POINTER.items()]
-    lines += [f"| `{name}` | {does} |" for name, does in KEYS.items()]
+    """Return the table of the pointer and the keys of a session's page."""
+    lines = [f"| {name} | {action} |" for name, action in POINTER.items()]
+    lines += [f"| `{name}` | {action} |" for name, action in KEYS.items()]
     return "| | |\n|---|---|\n" + "\n".join(lines) + "\n"
 
 
 def model_keys(model: type[Section], *titles: str) -> str:
-    """Give the table of the keys of a section that has none below it."""
+    """Return the table of the keys of a section without subsections."""
     lines = []
     for name, field in model.model_fields.items():
         assert isinstance(field.json_schema_extra, dict)
@@ -68,12 +68,12 @@ def model_keys(model: type[Section], *titles: str) -> str:
 
 
 def readers(table: Sequence[CalibrationReader] | Sequence[TrajectoryReader]) -> str:
-    """Give the table of readers of camera files."""
+    """Return the table of readers of camera files."""
     lines = [f"| {reader.name} | {reader.recognised_by} |" for reader in table]
     return "| format | recognised by |\n|---|---|\n" + "\n".join(lines) + "\n"
 
 
-# What makes each table, by its page and its name there.
+# Functions that make the tables, by page and name.
 TABLES: dict[tuple[str, str], Callable[[], str]] = {
     ("keys", "keys"): scene_keys,
     ("view", "hands"): page_keys,
@@ -85,10 +85,8 @@ TABLES: dict[tuple[str, str], Callable[[], str]] = {
 
 
 def with_table(text: str, name: str, table: str) -> str:
-    """Replace what is between the marks of a table."""
-    start, end = (mark.format(name) for mark in MARKS)
-    before, rest = text.split(start)
-    return before + start + table + end + rest.split(end)[1]
+    """Return the text of a page with a table between its marks."""
+    return replace_marked(text, name, "docs/make_tables.py", table)
 
 
 def main() -> None:

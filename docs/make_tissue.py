@@ -69,7 +69,7 @@ def lattice_stress(a: float, b: float, g: float = 0.0, angle: float = 0.0, law: 
 
 
 def stretch_lattice(angle: float, law: tuple[float, float] = LOCK) -> tuple[Floats, Floats]:
-    """Return stress and width at STRETCHES along an angle to the rows, where nothing holds the sides."""
+    """Return stress and width at STRETCHES along an angle to the rows, with free sides."""
     stress, width, free = [], [], np.array([1.0, 0.0])
     for a in STRETCHES:
         free = root(lambda free, a=a: lattice_stress(a, free[0], free[1], angle, law)[1:], free).x
@@ -97,8 +97,8 @@ def solid_stress(law: str, shape: float, stretch: Floats, *, both: bool) -> Floa
 def fit_shape(law: str, stress: Floats) -> float:
     """Return the shape with which a solid has the stress, with free sides, up to FIT_RANGE."""
     near = STRETCHES <= FIT_RANGE
-    found = least_squares(lambda s: solid_stress(law, s[0], STRETCHES[near], both=False) - stress[near], [4.0])
-    return float(found.x[0])
+    solution = least_squares(lambda s: solid_stress(law, s[0], STRETCHES[near], both=False) - stress[near], [4.0])
+    return float(solution.x[0])
 
 
 def draw_stretching() -> None:
@@ -113,29 +113,29 @@ def draw_stretching() -> None:
         "Ogden, one term": ("Ogden", fit_shape("Ogden", uniaxial), ORANGE),
     }
     with plt.style.context(STYLE, after_reset=True):
-        figure, (one, two, three) = plt.subplots(1, 3, figsize=(TWO_COLUMN_WIDTH, 3.1), layout="constrained")
+        figure, (uniaxial_axes, biaxial_axes, width_axes) = plt.subplots(
+            1, 3, figsize=(TWO_COLUMN_WIDTH, 3.1), layout="constrained"
+        )
         for name, (law, shape, colour) in solids.items():
-            for axes, both in ((one, False), (two, True)):
+            for axes, both in ((uniaxial_axes, False), (biaxial_axes, True)):
                 axes.plot(STRETCHES, solid_stress(law, shape, STRETCHES, both=both), color=colour, label=name)
             print(name, f"shape {shape:.3g}")
         for (name, (stress, width)), style in zip(lattice.items(), ("-", "--"), strict=True):
-            one.plot(STRETCHES, stress, style, color=BLUE, linewidth=1.8, label=f"sheet, {name}")
-            three.plot(STRETCHES, width, style, color=BLUE, linewidth=1.8, label=f"sheet, {name}")
-            print(
-                "width", name, dict(zip(STRETCHES[::20].round(2).tolist(), width[::20].round(3).tolist(), strict=True))
-            )
-            print(
-                "stress",
-                name,
-                dict(zip(STRETCHES[::20].round(2).tolist(), stress[::20].round(3).tolist(), strict=True)),
-            )
-        two.plot(STRETCHES, equal, color=BLUE, linewidth=1.8)
+            uniaxial_axes.plot(STRETCHES, stress, style, color=BLUE, linewidth=1.8, label=f"sheet, {name}")
+            width_axes.plot(STRETCHES, width, style, color=BLUE, linewidth=1.8, label=f"sheet, {name}")
+            for label, values in (("width", width), ("stress", stress)):
+                print(
+                    label,
+                    name,
+                    dict(zip(STRETCHES[::20].round(2).tolist(), values[::20].round(3).tolist(), strict=True)),
+                )
+        biaxial_axes.plot(STRETCHES, equal, color=BLUE, linewidth=1.8)
         strong = stretch_lattice(np.pi / 8, STRONG)[1]
-        three.plot(STRETCHES, strong, ":", color=PURPLE, linewidth=1.8, label="the same, lock 0.3, factor 30")
+        width_axes.plot(STRETCHES, strong, ":", color=PURPLE, linewidth=1.8, label="the same, lock 0.3, factor 30")
         for numbers in ((0.3, 10.0), STRONG, (0.3, 100.0)):
             ends = [stretch_lattice(angle, numbers)[1][-1] for angle in angles.values()]
             print(f"width at {STRETCHES[-1]}, lock and factor {numbers}: {ends[0]:.3f}, off the rows {ends[1]:.3f}")
-        three.plot(STRETCHES, STRETCHES**-0.5, color=INK, linewidth=0.8, label="incompressible solids")
+        width_axes.plot(STRETCHES, STRETCHES**-0.5, color=INK, linewidth=0.8, label="incompressible solids")
         for stretch in (1.1, 1.15, 1.2, 1.3):
             at = np.argmin(abs(STRETCHES - stretch))
             ratios = {
@@ -143,13 +143,13 @@ def draw_stretching() -> None:
                 for name, (law, shape, _) in solids.items()
             }
             print(f"equibiaxial at {stretch}: sheet {equal[at]:.3g}, over solids", ratios)
-        one.set(title="Stretched in one direction", ylabel="force / (E · section at rest)", ylim=(0, 1.5))
-        two.set(title="Stretched equally in both", ylabel="force / (E · section at rest)", ylim=(0, 3))
-        three.set(title="Width, stretched in one direction", ylabel="width / width at rest", ylim=(0.4, 1))
-        for axes in (one, two, three):
+        uniaxial_axes.set(title="Stretched in one direction", ylabel="force / (E · section at rest)", ylim=(0, 1.5))
+        biaxial_axes.set(title="Stretched equally in both", ylabel="force / (E · section at rest)", ylim=(0, 3))
+        width_axes.set(title="Width, stretched in one direction", ylabel="width / width at rest", ylim=(0.4, 1))
+        for axes in (uniaxial_axes, biaxial_axes, width_axes):
             axes.set(xlabel="stretch", xlim=(1, 1.4))
-        one.legend(loc="upper left")
-        three.legend(loc="lower left")
+        uniaxial_axes.legend(loc="upper left")
+        width_axes.legend(loc="lower left")
         figure.savefig(IMAGES / "tissue-stretch.png", dpi=DPI)
         plt.close(figure)
 
@@ -192,13 +192,13 @@ def draw_relaxation() -> None:
         left.axvspan(*BAND, color=SILVER, alpha=0.18, linewidth=0)
         for wanted, colour in LOSS_FACTORS.items():
             shares, times = fit_branches(wanted)
-            found = loss_factor(shares, times, frequency)
+            achieved = loss_factor(shares, times, frequency)
             inside = (frequency >= BAND[0]) & (frequency <= BAND[1])
-            worst = abs(found[inside] / wanted - 1).max()
+            worst = abs(achieved[inside] / wanted - 1).max()
             print(
                 f"loss factor {wanted}: shares {shares.round(3)}, times {times.round(4)} s, within {100 * worst:.2g} %"
             )
-            left.plot(frequency, found, color=colour)
+            left.plot(frequency, achieved, color=colour)
             left.plot(BAND, [wanted, wanted], color=INK, linewidth=0.6, linestyle=":")
             left.text(1, wanted * 1.07, f"{wanted:g}", color=colour, ha="center", va="bottom", fontweight="bold")
         left.set(title="Loss factor of three branches", xlabel="frequency [Hz]", ylabel="lost / stored modulus")

@@ -43,7 +43,7 @@ def on_files(files: Files, config: MkDocsConfig) -> Files:
 
 
 def on_page_markdown(markdown: str, page: Page, files: Files, **_: object) -> str:
-    """Point links at the places that their targets have in the site."""
+    """Rewrite links to the paths of their targets in the site."""
 
     def moved(link: re.Match[str]) -> str:
         path, anchor = resolve(page.file.src_uri, link[1]), link[2] or ""

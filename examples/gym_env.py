@@ -1,4 +1,4 @@
-"""A gymnasium environment: a finger goes down onto tissue, at a random place, until it feels half a newton."""
+"""A gymnasium environment: lower a finger onto tissue, at a random position, until the force is half a newton."""
 
 from pathlib import Path
 
@@ -6,23 +6,26 @@ import gymnasium
 import numpy as np
 
 SCENE = Path(__file__).parents[1] / "scenes/press.yaml"
-ROD = {"radius": 0.005, "shaft": [0.3, -0.4, 1], "length": 0.15}
+FINGER = {"radius": 0.005, "shaft": [0.3, -0.4, 1], "length": 0.15}
 TARGET = 0.5  # N
 
 
 class Palpation(gymnasium.Env):
-    """Observe a picture, lower the finger by up to 0.5 mm a frame; the reward is minus the error of its force [N]."""
+    """Observation: a picture. Action: lower the finger by up to 0.5 mm per frame. Reward: minus the force error [N]."""
 
     observation_space = gymnasium.spaces.Box(0, 255, (128, 128, 3), np.uint8)
     action_space = gymnasium.spaces.Box(-1, 1, (1,), np.float32)
     simulation = None
 
     def reset(self, *, seed=None, options=None):
-        from taichi_msm import Simulation, load_scene  # Here, as the parent of spawned environments never resets one.
+        from taichi_msm import (
+            Simulation,
+            load_scene,
+        )  # Not at the top: the parent of spawned environments never needs it.
 
         super().reset(seed=seed)
         self.place, self.height = self.np_random.uniform(0.3, 0.7, 2).tolist(), 0.0
-        finger = {"path": [[0, *self.place, self.height]], "instrument": ROD}
+        finger = {"path": [[0, *self.place, self.height]], "instrument": FINGER}
         scene = load_scene(SCENE, {"probes": [finger], "render.size": [128, 128]})
         if self.simulation is None:
             self.simulation = Simulation(scene, threads=1)
@@ -35,8 +38,8 @@ class Palpation(gymnasium.Env):
         self.simulation.steer([{"path": [[self.simulation.time + 0.02, *self.place, self.height]]}])
         self.simulation.advance()
         force = -self.simulation.forces()[0].force[2]
-        reward, ends, is_long = -abs(force - TARGET), bool(force >= TARGET), self.simulation.frame >= 50
-        return self.simulation.draw(), reward, ends, is_long, {"force": force}
+        terminated, truncated = bool(force >= TARGET), self.simulation.frame >= 50
+        return self.simulation.draw(), -abs(force - TARGET), terminated, truncated, {"force": force}
 
 
 if __name__ == "__main__":

@@ -4,7 +4,7 @@ import os
 import shutil
 import signal
 import subprocess
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 
 import pytest
@@ -20,8 +20,8 @@ from tests import golden
 from tests.golden import Messages
 from tests.scenes import SMALL, speckle
 
-# These files take longest.
-LONGEST = {f"test_{name}" for name in ("docs", "vulkan", "lens", "rest", "cluster", "sweep", "contact", "study", "fit")}
+# The slowest test files, which begin.
+SLOWEST = {f"test_{name}" for name in ("docs", "vulkan", "lens", "rest", "cluster", "sweep", "contact", "study", "fit")}
 
 
 def pytest_addoption(parser: pytest.Parser) -> None:
@@ -30,12 +30,12 @@ def pytest_addoption(parser: pytest.Parser) -> None:
 
 @pytest.hookimpl(tryfirst=True)
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Mark all but the default cases as slow, and begin with the files that take longest."""
+    """Mark all but the default cases as slow, and begin with the slowest files."""
     for item in items:
         chosen = item.get_closest_marker("default_cases")
         if isinstance(item, pytest.Function) and chosen and item.callspec.id not in chosen.args:
             item.add_marker(pytest.mark.slow)
-    items.sort(key=lambda item: item.path.stem not in LONGEST)
+    items.sort(key=lambda item: item.path.stem not in SLOWEST)
 
 
 @pytest.fixture(scope="session")
@@ -50,17 +50,16 @@ def root() -> Path:
 
 
 @pytest.fixture(scope="session", autouse=True)
-def own_kernel_cache(tmp_path_factory: pytest.TempPathFactory) -> None:
-    """Kernels compiled by the tests, also in child processes, come from this tree and no earlier one."""
+def kernel_cache(tmp_path_factory: pytest.TempPathFactory) -> None:
+    """A cache of compiled kernels for this session, its child processes and all workers of pytest-xdist."""
     base = tmp_path_factory.getbasetemp()
-    # All workers of pytest-xdist share one.
     shared = base.parent if "PYTEST_XDIST_WORKER" in os.environ else base
     os.environ[active_compiler().folder_variable] = str(shared / "kernels")
 
 
 @pytest.fixture(scope="session")
 def written_messages(request: pytest.FixtureRequest) -> Iterator[golden.Golden | None]:
-    """The messages that the session writes, or None where it compares."""
+    """The messages that the session writes, or None if it compares them."""
     written: golden.Golden | None = {} if request.config.getoption("--write-messages") else None
     yield written
     if written:
@@ -81,9 +80,15 @@ def write_small(folder: Path, height: int = 30, width: int = 40) -> None:
     (folder / "small.yaml").write_text(SMALL)
 
 
+def _run_small(device: runtime.Device, folder: Path, out: str, overrides: Sequence[str] = ()) -> Path:
+    """Run small.yaml in a folder without an error estimate; returns the folder of the results."""
+    run(load_scene(folder / "small.yaml", overrides), folder / out, threads=device.threads, estimate_error=False)
+    return folder / out
+
+
 @pytest.fixture
 def small(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """A directory to work in, with small.yaml and its picture."""
+    """The current directory, with small.yaml and its picture."""
     write_small(tmp_path)
     monkeypatch.chdir(tmp_path)
     return tmp_path
@@ -91,11 +96,10 @@ def small(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 @pytest.fixture(scope="session")
 def ran(device: runtime.Device, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The results of a run of small.yaml, in `output/small` beside its scene; to be read only."""
-    here = tmp_path_factory.mktemp("ran")
-    write_small(here)
-    run(load_scene(here / "small.yaml"), here / "output" / "small", threads=device.threads, estimate_error=False)
-    return here / "output" / "small"
+    """The results of a run of small.yaml, in `output/small` next to its scene; read-only."""
+    folder = tmp_path_factory.mktemp("ran")
+    write_small(folder)
+    return _run_small(device, folder, "output/small")
 
 
 @pytest.fixture
@@ -105,22 +109,21 @@ def results(ran: Path, tmp_path: Path) -> Path:
 
 
 @pytest.fixture(scope="session")
-def seen_by_two(device: runtime.Device, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A run as two cameras beside each other have seen it, in `left` and `right`, to be read only; of 320 x 256 px."""
-    here = tmp_path_factory.mktemp("stereo")
-    write_small(here, 60, 80)
+def stereo_run(device: runtime.Device, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A run with a stereo pair of cameras, `left` and `right`, of 320 x 256 px; read-only."""
+    folder = tmp_path_factory.mktemp("stereo")
+    write_small(folder, 60, 80)
     left = "{eye: [-0.004, -0.1, 0.5], target: [-0.004, 0, 0], fov: 38}"
     cameras = f"render.cameras={{left: {left}, right: {{beside: left, baseline: 0.008}}}}"
     overrides = [cameras, "render.size=[320, 256]", "render.tracks=6", "output=[png, trajectory, forces, tracks]"]
-    run(load_scene(here / "small.yaml", overrides), here / "stereo", threads=device.threads, estimate_error=False)
-    return here / "stereo"
+    return _run_small(device, folder, "stereo", overrides)
 
 
 @pytest.fixture(scope="session")
 def labelled_in_motion(device: runtime.Device, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A run with a drawn tool that a moving, centred camera has seen, with its labels; to be read only."""
-    here = tmp_path_factory.mktemp("labelled")
-    write_small(here)
+    """A run with labels, a drawn tool and a moving, centred camera; read-only."""
+    folder = tmp_path_factory.mktemp("labelled")
+    write_small(folder)
     eye = "[[0, 0, -0.1, 0.5], [0.4, 0.02, -0.1, 0.45]]"
     overrides = [
         f"render.camera={{eye: {eye}, intrinsics: {{fx: 45, fy: 45, cx: 20, cy: 16}}}}",
@@ -130,19 +133,18 @@ def labelled_in_motion(device: runtime.Device, tmp_path_factory: pytest.TempPath
         "time.duration=0.2",
         "output=[png, trajectory, depth, flow, instrument, tracks]",
     ]
-    run(load_scene(here / "small.yaml", overrides), here / "labelled", threads=device.threads, estimate_error=False)
-    return here / "labelled"
+    return _run_small(device, folder, "labelled", overrides)
 
 
 @pytest.fixture
-def stereo(seen_by_two: Path, tmp_path: Path) -> Path:
-    """A copy of these results, to be changed."""
-    return Path(shutil.copytree(seen_by_two, tmp_path / "stereo"))
+def stereo(stereo_run: Path, tmp_path: Path) -> Path:
+    """A copy of the results of `stereo_run`, to be changed."""
+    return Path(shutil.copytree(stereo_run, tmp_path / "stereo"))
 
 
 @pytest.fixture(autouse=True)
 def handlers() -> Iterator[None]:
-    """Restore the handlers of signals, which the command line replaces, before the next test."""
+    """Restore the signal handlers, which the command line replaces."""
     before = {number: signal.getsignal(number) for number in SIGNALS}
     yield
     for number, handler in before.items():
@@ -154,13 +156,13 @@ Program = Callable[..., subprocess.CompletedProcess[str]]
 
 @pytest.fixture
 def program(device: runtime.Device, capfd: pytest.CaptureFixture[str]) -> Program:
-    """The program in this process, for what needs none of its own."""
+    """The program, called in this process."""
 
     def call(*arguments: str) -> subprocess.CompletedProcess[str]:
         takes_threads = arguments[0] in ("run", "study", "view")
         capfd.readouterr()
         code = main([*arguments, *(("--threads", str(device.threads)) if takes_threads else ())])
-        said = capfd.readouterr()
-        return subprocess.CompletedProcess(arguments, code, said.out, said.err)
+        printed = capfd.readouterr()
+        return subprocess.CompletedProcess(arguments, code, printed.out, printed.err)
 
     return call

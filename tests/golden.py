@@ -1,7 +1,7 @@
-"""The golden file of messages: every message of the program under the test that provokes it.
+"""The golden file of messages: every message of the program, by the test that provokes it.
 
 `python -m pytest --write-messages` writes the messages of the tests that run into tests/messages.yaml, to be read as a
-diff. Elsewhere tests assert the key, the place and a word at most, so the wording changes in that file alone.
+diff. Tests themselves assert at most a key, a location and a word, so wording changes in that file alone.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ Golden = dict[str, dict[str, list[str]]]
 
 
 class Dumper(yaml.SafeDumper):
-    """Writes texts of several lines as blocks."""
+    """YAML dumper that writes texts of several lines as blocks."""
 
 
 def _represent_text(dumper: Dumper, text: str) -> yaml.ScalarNode:
@@ -44,7 +44,7 @@ def read() -> Golden:
 
 
 def write(changed: Golden) -> None:
-    """Put the messages of the tests that ran into the file; workers of pytest-xdist take turns."""
+    """Update the messages of the tests that ran in the file, under a lock, as workers of pytest-xdist share it."""
     with FILE.open("r+", encoding="utf-8") as file:
         fcntl.flock(file, fcntl.LOCK_EX)
         golden: Golden = yaml.safe_load(file) or {}
@@ -57,12 +57,12 @@ def write(changed: Golden) -> None:
 
 
 class Messages:
-    """The messages of one test, compared with the golden file in the order in which they come.
+    """The messages of one test, compared with the golden file in order.
 
     Args:
         node: id of the test.
-        temporary: folder of the session's temporary folders; each of these is TMP in the file.
-        written: messages of the session to be written; None where they are compared.
+        temporary: folder of the session's temporary folders, each of which is TMP in the file.
+        written: where the session collects messages to write; None compares them.
     """
 
     def __init__(self, node: str, temporary: Path, written: Golden | None) -> None:
@@ -75,8 +75,8 @@ class Messages:
 
         Args:
             message: text, or lines.
-            words: key, place or word that it must contain whatever its wording.
-            hide: pattern of parts that differ between machines; an ellipsis in the file.
+            words: keys, locations or words that it must contain.
+            hide: pattern of parts that differ between machines, which become an ellipsis.
         """
         text = message if isinstance(message, str) else "\n".join(message)
         text = re.sub(hide, "…", self._temporary.sub("TMP", text)).rstrip("\n")

@@ -1,57 +1,55 @@
-"""The examples do what they say; those that need packages that the program does not are skipped without them."""
+"""The examples; skipped without packages that the program does not need."""
 
 from __future__ import annotations
 
 import runpy
 import subprocess
 import sys
-from functools import partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 
 import taichi_msm
+from taichi_msm.runs.simulation import Simulation
 from taichi_msm.system.runtime import Device
 
 
-def test_the_environment_passes_gymnasiums_checks_and_reaches_its_force(
-    device: Device, root: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_gymnasium_environment(device: Device, root: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     checker = pytest.importorskip("gymnasium.utils.env_checker")
-    # A process has one number of threads.
-    monkeypatch.setattr(taichi_msm, "Simulation", partial(_simulation, device.threads), raising=False)
-    made = runpy.run_path(str(root / "examples" / "gym_env.py"))["Palpation"]()
-    checker.check_env(made, skip_render_check=True)
-    picture, _ = made.reset(seed=1)
+
+    def simulation(scene: taichi_msm.Scene, threads: int) -> Simulation:
+        assert threads == 1
+        # A process has a single number of threads.
+        return Simulation(scene, threads=device.threads)
+
+    monkeypatch.setattr(taichi_msm, "Simulation", simulation, raising=False)
+    environment: Any = runpy.run_path(str(root / "examples" / "gym_env.py"))["Palpation"]()
+    checker.check_env(environment, skip_render_check=True)
+    picture, _ = environment.reset(seed=1)
     assert picture.std() > 10
-    down, ended, rewards = np.ones(1, np.float32), False, []
-    while not ended:
-        _, reward, ended, late, info = made.step(down)
+    terminated, rewards = False, []
+    while not terminated:
+        _, reward, terminated, truncated, info = environment.step(np.ones(1, np.float32))
         rewards.append(reward)
-        assert not late
-    # The force was below 0.5 N one frame, half a millimetre, before.
+        assert not truncated
+    # The force was below 0.5 N in the frame before, half a millimetre higher.
     assert 0.5 <= info["force"] < 0.6
     assert rewards[-1] == pytest.approx(0.5 - info["force"])
     assert rewards[-1] > min(rewards) == rewards[0]
-    made.simulation.close()
-
-
-def _simulation(device_threads: int, scene: taichi_msm.Scene, threads: int) -> taichi_msm.Simulation:
-    from taichi_msm.runs.simulation import Simulation
-
-    assert threads == 1
-    return Simulation(scene, threads=device_threads)
+    environment.simulation.close()
 
 
 @pytest.mark.slow
-def test_four_environments_run_in_spawned_processes(root: Path) -> None:
+def test_four_environments_in_spawned_processes(root: Path) -> None:
     pytest.importorskip("gymnasium")
-    done = subprocess.run(
-        [sys.executable, "examples/gym_env.py"], cwd=root, capture_output=True, text=True, check=False
-    )
+
+    def run(*arguments: str) -> subprocess.CompletedProcess[str]:
+        return subprocess.run([sys.executable, *arguments], cwd=root, capture_output=True, text=True, check=False)
+
+    done = run("examples/gym_env.py")
     assert done.stdout.startswith("four fingers feel 0.5"), done.stderr
     # A process may end with an open simulation.
-    code = "from examples.gym_env import Palpation; made = Palpation(); made.reset(seed=0)"
-    done = subprocess.run([sys.executable, "-c", code], cwd=root, capture_output=True, text=True, check=False)
+    done = run("-c", "from examples.gym_env import Palpation; made = Palpation(); made.reset(seed=0)")
     assert (done.returncode, done.stderr) == (0, "")

@@ -1,4 +1,4 @@
-"""The golden file holds every message of the program; here are those that no other test provokes."""
+"""Completeness of the golden file of messages, and the messages that no other test provokes."""
 
 from __future__ import annotations
 
@@ -13,6 +13,7 @@ from taichi_msm.errors import ArgumentError, SceneError
 from taichi_msm.fitting.fit import fit
 from taichi_msm.load.scene_file import load_scene
 from taichi_msm.runs.simulation import Player
+from taichi_msm.sweeps.spec import load_sweep
 from tests.golden import Messages, read
 from tests.scenes import scene
 
@@ -21,13 +22,13 @@ EYE = "eye: [0, 0, 1]"
 OVERRIDES = {
     "fisheye coefficient": f"render.camera={{{EYE}, distortion: {{model: fisheye, p1: 0.1}}}}",
     "lens without a required coefficient": f"render.camera={{{EYE}, distortion: {{model: omnidir, k1: 0.1}}}}",
-    "focal length nowhere": f"render.camera={{{EYE}, intrinsics: {{fx: 500, cx: 20, cy: 15}}}}",
-    "principal point nowhere": f"render.camera={{{EYE}, distortion: {{model: scaramuzza, a0: 500}}}}",
+    "focal length missing": f"render.camera={{{EYE}, intrinsics: {{fx: 500, cx: 20, cy: 15}}}}",
+    "principal point missing": f"render.camera={{{EYE}, distortion: {{model: scaramuzza, a0: 500}}}}",
     "two focal lengths": (
         f"render.camera={{{EYE}, intrinsics: {{fx: 500, cx: 20, cy: 15}}, distortion: {{model: scaramuzza, a0: 501}}}}"
     ),
-    "outside alone": f"render.camera={{{EYE}, outside: background}}",
-    "beside alone": "render.camera={beside: left, baseline: 0.01}",
+    "outside without distortion": f"render.camera={{{EYE}, outside: background}}",
+    "beside without cameras": "render.camera={beside: left, baseline: 0.01}",
     "no cameras": "render.cameras={}",
     "name of a preset": f"render.cameras={{top: {{{EYE}}}}}",
     "step and tolerance": "time={duration: 0.4, step: 1.0e-3, tolerance: 0.01}",
@@ -35,27 +36,35 @@ OVERRIDES = {
 
 
 @pytest.mark.parametrize("name", OVERRIDES)
-def test_keys_that_exclude_each_other(name: str, small: Path, message: Messages) -> None:
+def test_inconsistent_keys(name: str, small: Path, message: Messages) -> None:
     with message.raises(SceneError):
         load_scene("small.yaml", [OVERRIDES[name]])
 
 
-@pytest.mark.parametrize(
-    "text", ["width: 640\nmatrix: [1, 2]\n", "\xff", "x" * (2 << 20)], ids=["keys", "bytes", "long"]
-)
-def test_a_calibration_that_is_none(text: str, small: Path, message: Messages) -> None:
-    Path("c.yaml").write_bytes(text.encode("latin-1"))
-    with message.raises(SceneError, "render.camera.calibration"):
-        load_scene("small.yaml", ["render.camera={calibration: c.yaml, eye: [0, 0, 1]}"])
+CALIBRATIONS = {
+    "unknown keys": "width: 640\nmatrix: [1, 2]\n",
+    "no text": "\xff",
+    "no keys": "x" * (2 << 20),
+    "no size to scale by": "camera_matrix: [[500, 0, 20], [0, 500, 15], [0, 0, 1]]\ndist_coeffs: [0, 0, 0, 0]\n",
+}
 
 
-def test_a_calibration_without_a_size_is_not_scaled(small: Path, message: Messages) -> None:
-    Path("c.yaml").write_text("camera_matrix: [[500, 0, 20], [0, 500, 15], [0, 0, 1]]\ndist_coeffs: [0, 0, 0, 0]\n")
+@pytest.mark.parametrize("name", CALIBRATIONS)
+def test_unusable_calibration_files(name: str, small: Path, message: Messages) -> None:
+    Path("c.yaml").write_bytes(CALIBRATIONS[name].encode("latin-1"))
     with message.raises(SceneError, "render.camera.calibration"):
         load_scene("small.yaml", ["render.camera={calibration: c.yaml, scale: true, eye: [0, 0, 1]}"])
 
 
-def test_no_frames_are_played(message: Messages) -> None:
+@pytest.mark.parametrize("key", ["springs.shear: '=sqrt(1, 2)'", "damping=1: 0.01"], ids=["arguments", "path"])
+def test_invalid_keys_of_sweeps(key: str, small: Path, message: Messages) -> None:
+    vary = "damping: {uniform: [0.01, 0.02]}"
+    Path("sweep.yaml").write_text(f"{{scene: small.yaml, samples: 1, vary: {{{vary}}}, set: {{{key}}}}}")
+    with message.raises(SceneError):
+        load_sweep("sweep.yaml")
+
+
+def test_player_without_frames(message: Messages) -> None:
     with message.raises(ArgumentError, "frames"):
         Player([], 25)
 
@@ -70,7 +79,7 @@ def test_no_frames_are_played(message: Messages) -> None:
     ],
     ids=["bounds", "a list", "seconds", "correlation of positions"],
 )
-def test_a_fit_that_cannot_be_asked_for(free: list[str], options: dict[str, object], message: Messages) -> None:
+def test_invalid_options_of_fits(free: list[str], options: dict[str, object], message: Messages) -> None:
     tissue = {"young": 1e3, "thickness": 0.01, "density": 1000}
     made = scene(springs=None, damping=0, tissue=tissue, sheet={"points": [4, 5], "size": [0.3, 0.4]},
                  probes=[{"total": [0, 0, 1]}])  # fmt: skip
@@ -79,10 +88,10 @@ def test_a_fit_that_cannot_be_asked_for(free: list[str], options: dict[str, obje
         fit(made, observed, free, workers=1, **options)  # type: ignore[arg-type]
 
 
-# Messages of processes that die at the wrong moment, of foreign machines and of defects, by their longest fixed part.
+# Messages of processes killed at a certain moment, of foreign machines and of defects, by their longest fixed part.
 NOT_PROVOKED = {
     ", or smaller --bounds",
-    "; install there what is here",
+    "; install the same packages there",
     "; use these, or choose another --out",
     "=LOW,HIGH, factors of young",
     ": missing; put the picture back, the scene needs a copy of it",
@@ -114,18 +123,18 @@ def longest_part(node: ast.AST) -> str:
 
 def messages_of(file: Path) -> set[str]:
     """The longest fixed part of every message that a file raises or reports, if it has two words."""
-    found: set[str] = set()
+    parts: set[str] = set()
     for node in ast.walk(ast.parse(file.read_text(encoding="utf-8"))):
         arguments: list[ast.expr] = []
         if isinstance(node, ast.Raise) and isinstance(node.exc, ast.Call):
             arguments = node.exc.args
         elif isinstance(node, ast.Call) and ast.unparse(node.func).split(".")[-1] in ("Problem", "scene_fault"):
             arguments = node.args
-        found |= {part for part in map(longest_part, arguments) if len(part) > 13 and " " in part}
-    return found
+        parts |= {part for part in map(longest_part, arguments) if len(part) > 13 and " " in part}
+    return parts
 
 
-def test_every_message_has_a_case(root: Path) -> None:
+def test_every_message_is_provoked(root: Path) -> None:
     texts = [text for tests in read().values() for messages in tests.values() for text in messages]
     golden = re.sub(r"\s+", " ", "\n".join(texts))
     missing = {

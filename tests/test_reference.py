@@ -1,4 +1,4 @@
-"""The twin against closed forms and against SciPy."""
+"""The NumPy reference against closed forms and SciPy."""
 
 from __future__ import annotations
 
@@ -12,13 +12,13 @@ from scipy.integrate import solve_ivp
 
 from taichi_msm.model.loads import evaluate_loads
 from taichi_msm.model.sheet import fixed_points, rest_positions
-from taichi_msm.scene.scene import Scene
+from taichi_msm.solver.planning import with_time
 from taichi_msm.terms.elasticity import energy_density
 from tests import reference
 from tests.scenes import plan_of, random_scene, random_tissue, scene, speckle
 
-# A 2 x 2 sheet without springs but virtual ones: four independent oscillators.
-ALONE = {
+# A 2 x 2 sheet with virtual springs only: four independent oscillators.
+OSCILLATORS = {
     "sheet": {"points": [2, 2], "size": [1, 1], "mass": 2.0, "fixed": "none"},
     "springs": {"virtual": 50.0, "virtual_active": "always"},
     "probes": [{"force": [0, 0, 3.0], "falloff": 0, "offset": 0}],
@@ -35,16 +35,17 @@ def discrete(n: NDArray[np.int_], h: float, w: float, g: float, rest: float) -> 
 
 
 @pytest.mark.parametrize("damping", [0.0, 4.0])
-def test_one_oscillator_follows_the_discrete_solution(damping: float) -> None:
-    made = scene(**ALONE, damping=damping, time={"duration": 4.0, "step": 0.02})
-    z = np.array([u[0, 0, 2] for u in reference.displacements(plan_of(made))])
-    exact = discrete(np.arange(len(z)), 0.02, 5.0, damping / 2.0, 3.0 / 50.0)
+def test_oscillator_matches_the_discrete_solution(damping: float) -> None:
+    made = scene(**OSCILLATORS, damping=damping, time={"duration": 4.0, "step": 0.02})
+    u = np.array([u[0, 0] for u in reference.displacements(plan_of(made))])
+    exact = discrete(np.arange(len(u)), 0.02, 5.0, damping / 2.0, 3.0 / 50.0)
     # 200 steps, each of which rounds numbers of at most 0.12.
-    np.testing.assert_allclose(z, exact, rtol=0, atol=200**2 * 1.2e-17)
+    np.testing.assert_allclose(u[:, 2], exact, rtol=0, atol=200**2 * 1.2e-17)
+    assert not u[:, :2].any()
 
 
-def test_backward_damping_is_the_literal_recurrence() -> None:
-    made = scene(**ALONE, damping=4.0, time={"duration": 0.4, "step": 0.02, "damping_difference": "backward"})
+def test_backward_damping_matches_the_recurrence() -> None:
+    made = scene(**OSCILLATORS, damping=4.0, time={"duration": 0.4, "step": 0.02, "damping_difference": "backward"})
     u = [0.0, 0.02**2 * 3.0 / 2.0 / 2]
     for _ in range(19):
         u.append(2 * u[-1] - u[-2] + 0.02**2 * (3.0 - 50.0 * u[-1]) / 2.0 - 2.0 * 0.02 * (u[-1] - u[-2]))
@@ -52,53 +53,37 @@ def test_backward_damping_is_the_literal_recurrence() -> None:
     np.testing.assert_allclose(z, u, atol=1e-16)
 
 
-def test_static_balance_of_virtual_springs_and_force() -> None:
-    # Overdamped (g = 20 > 2 w = 10): the slow mode decays as exp(-1.34 t), to 1e-11 of itself after 20 s.
-    made = scene(**ALONE, damping=40.0, time={"duration": 20.0})
-    *_, last = reference.displacements(plan_of(made))
-    np.testing.assert_allclose(last[..., 2], 3.0 / 50.0, rtol=1e-10)
-    assert np.abs(last[..., :2]).max() == 0
-
-
-def test_a_single_stretched_spring_pulls_with_hookes_force() -> None:
+def test_hookes_law() -> None:
     made = scene(sheet={"points": [2, 2], "size": [1, 2], "mass": 1}, springs={"structural": 7.0}, probes=[])
     u = np.zeros((2, 2, 3))
     u[0, 1] = [0.5, 0, 0]
-    force = reference.elastic_force(made, u)
     # Along the top edge the spring of length 2 is 0.5 longer; the right edge of length 1 is now sqrt(1.25) long.
     pull = 7.0 * (np.sqrt(1.25) - 1) / np.sqrt(1.25)
-    np.testing.assert_allclose(force[0, 0], [3.5, 0, 0], atol=1e-15)
-    np.testing.assert_allclose(force[1, 1], pull * np.array([0.5, 1, 0]), atol=1e-15)
-    np.testing.assert_allclose(force[0, 1], [-3.5 - pull * 0.5, -pull, 0], atol=1e-15)
-    np.testing.assert_allclose(force.sum(axis=(0, 1)), 0, atol=1e-15)
+    exact = [[[3.5, 0, 0], [-3.5 - pull * 0.5, -pull, 0]], [[0, 0, 0], [pull * 0.5, pull, 0]]]
+    np.testing.assert_allclose(reference.elastic_force(made, u), exact, atol=1e-15)
 
 
-def test_a_spring_without_length_has_no_force() -> None:
+def test_spring_of_zero_length_has_no_force() -> None:
     made = scene(sheet={"points": [2, 2], "size": [1, 1], "mass": 1}, springs={"structural": 7.0}, probes=[])
     u = np.zeros((2, 2, 3))
     u[:, 1, 0] = -1.0
-    force = reference.elastic_force(made, u)
-    assert np.isfinite(force).all()
-    np.testing.assert_allclose(force, 0, atol=1e-15)
+    np.testing.assert_allclose(reference.elastic_force(made, u), 0, atol=1e-15)
 
 
 @pytest.mark.parametrize("seed", range(4))
-def test_the_density_of_energy_adds_up_to_the_energy_of_the_springs(seed: int, tmp_path: Path) -> None:
-    """With a map, tension, free edges and cells that are not square; bending, which is no spring's, is left out."""
+def test_energy_density_integrates_to_the_energy_of_the_springs(seed: int, tmp_path: Path) -> None:
+    """With a map, tension, free edges and cells that are not square; without bending."""
     Image.fromarray(speckle(7, 5)).save(tmp_path / "map.png")
-    tissue = random_tissue(seed, str(tmp_path / "map.png"))
-    for made in (without_bending(tissue), random_scene(seed)):
+    plate = random_tissue(seed, str(tmp_path / "map.png"))
+    assert plate.tissue is not None
+    membrane = plate.model_copy(update={"tissue": plate.tissue.model_copy(update={"bending": 0.0})})
+    for made in (membrane, random_scene(seed)):
         displacement = np.random.default_rng(seed).normal(0, 1e-3, (*made.sheet.points, 3))
         height, width = made.sheet.size
         share = np.outer(*(np.r_[0.5, np.ones(count - 2), 0.5] / (count - 1) for count in made.sheet.points))
         total = (energy_density(plan_of(made), displacement) * share).sum() * height * width
-        # Sums over less than 2000 springs, of which those under tension hold numbers of both signs.
+        # Sums over less than 2000 springs; those under tension have terms of both signs.
         assert total == pytest.approx(reference.energy(made, displacement), rel=1e-11)
-
-
-def without_bending(scene: Scene) -> Scene:
-    assert scene.tissue is not None
-    return scene.model_copy(update={"tissue": scene.tissue.model_copy(update={"bending": 0.0})})
 
 
 def test_agrees_with_dop853() -> None:
@@ -116,12 +101,10 @@ def test_agrees_with_dop853() -> None:
     exact = solved.y[:, -1].reshape(2, *rest.shape)[0]
     errors = []
     for halvings in (3, 4):
-        fine = made.model_copy(
-            update={"time": made.time.model_copy(update={"step": plan_of(made).grid.step / 2**halvings})}
-        )
+        fine = with_time(made, step=plan_of(made).grid.step / 2**halvings)
         *_, last = reference.displacements(plan_of(fine))
         errors.append(np.abs(last - exact).max())
-    # Of order 2, so the finer one is wrong by a third of the difference of both; the integrator by far less.
+    # Order 2; the integrator's error is far smaller.
     assert 3.8 < errors[0] / errors[1] < 4.2
     assert errors[1] < 1e-3 * np.abs(exact).max()
     assert np.abs(exact).max() > 0.01
@@ -132,17 +115,14 @@ def test_agrees_with_dop853() -> None:
     [
         # The sheet is 0.3 m high and 0.4 m wide; a cell is 0.0375 m by 0.04 m.
         ((4, 5), (0.01, 0, 0), 0.75),
-        ((4, 5), (-0.01, 0, 0), 0.75),
         ((4, 5), (0, 0.03, 0), 0.2),
         ((8, 10), (-0.02, 0.01875, 0), 0.5),
         ((0, 10), (-0.04, -0.0375, 0), 0.0),
         ((4, 5), (0, 0, 5.0), 1.0),
     ],
 )
-def test_the_shortest_spring(point: tuple[int, int], to: tuple[float, float, float], ratio: float) -> None:
+def test_shortest_spring(point: tuple[int, int], to: tuple[float, float, float], ratio: float) -> None:
     displacement = np.zeros((9, 11, 3))
     displacement[point] = to
-    before = displacement.copy()
     assert reference.shortest_spring(scene(), displacement) == pytest.approx(ratio, abs=1e-12)
-    np.testing.assert_array_equal(displacement, before)
     assert reference.shortest_spring(scene(springs={}), displacement) == 1

@@ -1,13 +1,13 @@
-"""Drawing beside other ways to do it; the first peer is this program."""
+"""Peers of the drawing; the first is this program."""
 
-# Those that draw the same scene: the refined surface, lit.
+# Peers that draw the same scene: the refined surface, lit.
 LIT = {
     "taichi_msm": "benchmarks.drawing.msm",
     "moderngl": "benchmarks.drawing.moderngl_",
     "VTK": "benchmarks.drawing.vtk_",
 }
 
-# Those that warp the picture without light, and this program without light.
+# Peers that warp the picture without light, and this program without light.
 FLAT = {
     "taichi_msm": "benchmarks.drawing.msm",
     "cv2.remap": "benchmarks.drawing.cv2_",

@@ -1,6 +1,6 @@
 """cv2.remap: the picture warped by the displacement of the mass points, without light, depth or folds.
 
-remap asks for every pixel where it comes from, X with X + u(X) = x; three rounds of X = x - u(X) find it.
+The map of remap has for every pixel x the source X with X + u(X) = x, by three fixed-point iterations of X = x - u(X).
 """
 
 from __future__ import annotations
@@ -13,32 +13,32 @@ from numpy.typing import NDArray
 
 from benchmarks.drawing.problem import POINTS, SIDE, Picture, Problem
 
-ROUNDS = 3
+ITERATIONS = 3
 
 
 class Remap:
-    """The maps, made once and filled for every picture."""
+    """The maps, allocated once and filled for every picture."""
 
     def __init__(self, problem: Problem) -> None:
         pixels = problem.pixels
         self._rest, self._texture = problem.rest, problem.texture
         self._pixel = np.stack(np.meshgrid(*[np.arange(pixels, dtype=np.float32)] * 2), axis=-1)
-        # From pixels to mass points and to texels, whose centres are halves.
+        # From pixels to mass points and to texels, whose centres are at halves.
         self._to_points = (POINTS - 1) / pixels
         self._to_texels = self._texture.shape[0] / pixels
 
     def texels(self, position: NDArray[np.float32]) -> NDArray[np.float32]:
-        """Find the texel that each pixel shows, shape (pixels, pixels, 2)."""
+        """Return the source texel of each pixel, shape (pixels, pixels, 2)."""
         moved = (position - self._rest)[..., :2] * (np.array([1, -1], np.float32) * (self._pixel.shape[0] / SIDE))
         centre = (self._pixel + 0.5) * self._to_points
-        place = centre
-        for _ in range(ROUNDS):
-            back = cv2.remap(moved, place, None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
-            place = centre - back * self._to_points
-        return place * (self._to_texels / self._to_points) - 0.5
+        source = centre
+        for _ in range(ITERATIONS):
+            back = cv2.remap(moved, source, None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+            source = centre - back * self._to_points
+        return source * (self._to_texels / self._to_points) - 0.5
 
     def resample(self, texels: NDArray[Any], fractions: NDArray[np.uint16] | None = None) -> Picture:
-        """Take the colours of texels: of float32, or of OpenCV's fixed point, whose fractions are apart."""
+        """Resample at texels, in float32 or in OpenCV's fixed point with separate fractions."""
         return cv2.remap(self._texture, texels, fractions, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
 
     def draw(self, position: NDArray[np.float32]) -> Picture:

@@ -1,6 +1,6 @@
-"""cv2.remap alone: its maps are made once, so that it draws this one position and no other.
+"""cv2.remap alone: the maps are precomputed, for this position only.
 
-They are OpenCV's fixed-point maps, of 1/32 texel, with which remap takes 0.8 of the time that it takes with float32.
+They are OpenCV's fixed-point maps, of 1/32 texel: remap takes 0.8 of the time with float32.
 """
 
 from __future__ import annotations
@@ -27,5 +27,5 @@ class Resampling:
 
 
 def prepare(problem: Problem, threads: int | None) -> Artist:
-    """Make the maps."""
+    """Precompute the maps."""
     return Resampling(problem, cv2_.prepare(problem, threads))

@@ -1,4 +1,4 @@
-"""What is measured of a peer: whether its picture is right, and the time of a picture."""
+"""Measurements of a drawing peer: correctness, and time of a picture."""
 
 from __future__ import annotations
 
@@ -16,9 +16,9 @@ from benchmarks.process import CACHE
 from taichi_msm.study.measurements import psnr
 from tests import reference
 
-# PSNR of a right picture [dB]: of this program against its float64 twin, which is too slow for more than the mass
-# points themselves; of others against this program. Who draws the same triangles differs by rounding and by who owns a
-# pixel on an edge; who warps the picture, by the curvature within a cell too.
+# Least PSNR [dB]: of this program against the NumPy reference, without refinement for speed; of others against this
+# program. Peers with the same triangles differ by rounding and in pixels on edges; peers that warp the picture, also by
+# the curvature within a cell.
 WANTED = {True: 45.0, False: 40.0}
 
 
@@ -28,7 +28,7 @@ def prepare(peer: str, problem: Problem, threads: int | None) -> Artist:
 
 
 def check(peer: str, pixels: int, refine: int, lit: bool, threads: int | None = None) -> dict[str, Any]:
-    """Compare a peer's picture with this program's, which is checked before all others, and time its start."""
+    """Compare a peer's picture with this program's, which is checked first, and time its start."""
     importlib.import_module(peer)
     problem = Problem(pixels, refine, lit)
     _ = problem.texture
@@ -36,26 +36,26 @@ def check(peer: str, pixels: int, refine: int, lit: bool, threads: int | None = 
     artist = prepare(peer, problem, threads)
     picture = artist.draw(problem.position)
     compile_seconds = time.perf_counter() - start
-    kept = CACHE / f"picture-{pixels}-{refine}-{lit}.npy"
+    cached = CACHE / f"picture-{pixels}-{refine}-{lit}.npy"
     if peer == LIT["taichi_msm"]:
-        np.save(kept, picture)
+        np.save(cached, picture)
         coarse = Problem(pixels, 0, lit)
         picture = prepare(peer, coarse, threads).draw(coarse.position)
         truth = reference.draw(coarse.scene, coarse.position.astype(float), coarse.texture)
     else:
-        truth = np.load(kept)
+        truth = np.load(cached)
     answer, wanted = psnr(picture, truth), WANTED[lit]
-    near = math.inf if answer is None else answer
+    decibel = math.inf if answer is None else answer
     return {
         "answer": answer,
-        "right": near >= wanted,
-        "wanted": f"{near:.1f} dB, of at least {wanted:g}",
+        "correct": decibel >= wanted,
+        "wanted": f"{decibel:.1f} dB, of at least {wanted:g}",
         "compile": compile_seconds,
     }
 
 
 def clock(peer: str, pixels: int, refine: int, lit: bool, threads: int | None = None) -> float:
-    """Time a picture [s]."""
+    """Return the time of a picture [s]."""
     problem = Problem(pixels, refine, lit)
     artist, position = prepare(peer, problem, threads), problem.position
     artist.draw(position)

@@ -1,4 +1,4 @@
-"""OpenGL by moderngl, on a processor by llvmpipe: mass points go in as textures; shaders refine, light and filter."""
+"""OpenGL by moderngl, on a CPU by llvmpipe: mass points are textures; shaders refine, light and filter."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ uniform int parts;
 uniform int vertices;
 uniform int points;
 uniform float side;
-out vec2 place;
+out vec2 coordinates;
 out float light;
 
 vec3 between(sampler2D values, ivec2 low, vec2 share) {
@@ -33,7 +33,7 @@ void main() {
     vec2 share = vec2(vertex - low * parts) / parts;
     vec3 position = between(point, low, share);
     light = abs(normalize(between(normal, low, share)).z);
-    place = vec2(vertex) / (vertices - 1);
+    coordinates = vec2(vertex) / (vertices - 1);
     gl_Position = vec4(position.x * 2 / side, -position.y * 2 / side, -position.z / side, 1);
 }
 """
@@ -42,24 +42,24 @@ FRAGMENT = """
 #version 330
 uniform sampler2D picture;
 uniform bool lit;
-in vec2 place;
+in vec2 coordinates;
 in float light;
 out vec4 colour;
 
 void main() {
-    colour = vec4(texture(picture, place).rgb * (lit ? light : 1.0), 1);
+    colour = vec4(texture(picture, coordinates).rgb * (lit ? light : 1.0), 1);
 }
 """
 
 
 class OpenGl:
-    """A context without a window, and what it draws."""
+    """An offscreen context with the sheet."""
 
     def __init__(self, problem: Problem) -> None:
         try:
             self._context = context = moderngl.create_context(standalone=True, backend="egl")
         except Exception as error:
-            raise UnavailableError(f"no OpenGL without a window: {error}") from None
+            raise UnavailableError(f"no offscreen OpenGL: {error}") from None
         n, pixels = problem.vertices, problem.pixels
         context.enable(moderngl.DEPTH_TEST)
         program = context.program(VERTEX, FRAGMENT)
@@ -72,7 +72,7 @@ class OpenGl:
         self._picture.filter = moderngl.LINEAR, moderngl.LINEAR
         self._picture.repeat_x = self._picture.repeat_y = False
         quad = np.arange(n - 1)[:, None, None] * n + np.arange(n - 1)[:, None]
-        # Each small quad is cut from its top left to its bottom right corner.
+        # The diagonal of each quad leads from its top left to its bottom right corner.
         index = context.buffer(np.add(quad, [0, n, n + 1, 0, n + 1, 1]).astype(np.int32).tobytes())
         self._sheet = context.vertex_array(program, [], index_buffer=index)
         self._frame = context.framebuffer(
@@ -97,6 +97,6 @@ class OpenGl:
 
 
 def prepare(problem: Problem, threads: int | None) -> OpenGl:
-    """Set up OpenGL; llvmpipe takes its number of threads from the environment."""
+    """Set up OpenGL; llvmpipe reads the number of threads from the environment."""
     del threads
     return OpenGl(problem)

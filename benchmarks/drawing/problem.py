@@ -1,7 +1,7 @@
-"""The one picture that all peers draw: the paper's sheet, pressed and dragged, seen from the top.
+"""The picture of all drawing peers: the paper's sheet, pressed and dragged, from the top.
 
-31 x 31 mass points, refined to 331 x 331 vertices, a texture over all of it. What is drawn, from positions of mass
-points to a picture in an array of NumPy, is the work.
+31 x 31 mass points, refined to 331 x 331 vertices, with a texture. The timed work leads from positions of mass points
+to a picture in a NumPy array.
 """
 
 from __future__ import annotations
@@ -25,38 +25,30 @@ Picture = NDArray[np.uint8]
 
 
 class Artist(Protocol):
-    """A peer with its problem; each module of a peer has `prepare(problem, threads)`, which makes one."""
+    """A peer that draws a problem; the module of each peer has `prepare(problem, threads)`, which returns one."""
 
     def draw(self, position: NDArray[np.float32]) -> Picture:
-        """Draw the sheet; positions of mass points [m], shape (rows, cols, 3)."""
+        """Draw the sheet from the positions of its mass points [m], shape (rows, cols, 3)."""
 
 
 @dataclass(frozen=True)
 class Problem:
-    """What a peer needs.
+    """The parameters of a problem."""
 
-    Attributes:
-        pixels: width and height of the picture.
-        refine: vertices between two mass points.
-        lit: whether there is a headlight.
-    """
-
-    pixels: int
-    refine: int
-    lit: bool
+    pixels: int  # width and height of the picture
+    refine: int  # vertices between two mass points
+    lit: bool  # with a headlight
 
     @cached_property
     def scene(self) -> Scene:
-        """The problem as this program takes it."""
+        """The problem as a scene of this program."""
         return Scene.model_validate(
             {
                 "image": str(ROOT / "scenes" / "textures" / "mucosa.png"),
                 "sheet": {"points": [POINTS, POINTS], "size": [SIDE, SIDE], "mass": 1e-3},
                 "springs": {"structural": 20, "shear": 20, "virtual": 0.5},
                 "damping": 0.02,
-                "probes": [
-                    {"force": [1500, 500, -3000], "load": [[0, 0], [0.2, 100]], "falloff": 60},
-                ],
+                "probes": [{"force": [1500, 500, -3000], "load": [[0, 0], [0.2, 100]], "falloff": 60}],
                 "time": {"duration": 0.4},
                 "render": {
                     "size": [self.pixels, self.pixels],
@@ -78,20 +70,20 @@ class Problem:
 
     @cached_property
     def position(self) -> NDArray[np.float32]:
-        """The sheet as it is pressed, the same for every picture; shape (rows, cols, 3)."""
-        kept = CACHE / "pressed.npy"
-        if not kept.exists():
+        """Positions of the pressed sheet's mass points, computed once [m], shape (rows, cols, 3)."""
+        cached = CACHE / "pressed.npy"
+        if not cached.exists():
             CACHE.mkdir(parents=True, exist_ok=True)
-            np.save(kept, reference.simulate(self.scene)[-1].astype(np.float32))
-        return np.load(kept)
+            np.save(cached, reference.simulate(self.scene)[-1].astype(np.float32))
+        return np.load(cached)
 
     @cached_property
     def rest(self) -> NDArray[np.float32]:
-        """The mass points at rest, shape (rows, cols, 3)."""
+        """Rest positions of the mass points [m], shape (rows, cols, 3)."""
         return rest_positions(self.scene.sheet).astype(np.float32)
 
     @cached_property
     def refinement(self) -> NDArray[np.float32]:
         """The matrix that inserts vertices along one axis, shape (vertices, mass points)."""
-        place = np.arange(self.vertices) / (self.refine + 1)
-        return np.maximum(0, 1 - np.abs(place[:, None] - np.arange(POINTS))).astype(np.float32)
+        index = np.arange(self.vertices) / (self.refine + 1)
+        return np.maximum(0, 1 - np.abs(index[:, None] - np.arange(POINTS))).astype(np.float32)

@@ -1,7 +1,6 @@
 """scikit-image's PiecewiseAffineTransform: the picture warped by the triangles of the mass points, without light.
 
-Of the mass points only, as each triangle costs a pass over the picture: with all 331 x 331 vertices it would take
-minutes.
+Without refinement: each triangle costs a pass over the picture, and 331 x 331 vertices would take minutes.
 """
 
 from __future__ import annotations
@@ -30,13 +29,13 @@ class Warp:
 
     @staticmethod
     def _on(position: NDArray[np.float32], size: int) -> NDArray[np.float64]:
-        """Give the places of points in a picture of that size, where the centre of a pixel is whole."""
-        place = (position[..., :2].astype(float) * [1, -1] / SIDE + 0.5) * size - 0.5
-        return place.reshape(-1, 2)
+        """Return points in a picture of `size` pixels; the centres of pixels are at integers."""
+        points = (position[..., :2].astype(float) * [1, -1] / SIDE + 0.5) * size - 0.5
+        return points.reshape(-1, 2)
 
 
 def prepare(problem: Problem, threads: int | None) -> Warp:
-    """Set up the warp; scikit-image takes one thread."""
+    """Set up the warp; scikit-image has one thread."""
     del threads
     if not hasattr(PiecewiseAffineTransform, "from_estimate"):
         raise UnavailableError("needs scikit-image 0.26")

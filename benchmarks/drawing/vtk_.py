@@ -1,4 +1,4 @@
-"""VTK without a window: a mesh whose vertices and normals are moved for every picture; on a processor, by llvmpipe."""
+"""Offscreen VTK: a mesh with new vertices and normals for every picture; on a CPU, by llvmpipe."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ class Vtk:
         self._window = vtk.vtkRenderWindow()
         self._window.OffScreenRenderingOn()
         if not self._window.SupportsOpenGL():
-            raise UnavailableError("no OpenGL without a window")
+            raise UnavailableError("no offscreen OpenGL")
         n = problem.vertices
         self._refinement = problem.refinement
         self._position, self._normal = (np.zeros((n * n, 3), np.float32) for _ in range(2))
@@ -26,7 +26,7 @@ class Vtk:
         self._mesh.SetPoints(vtk.vtkPoints())
         self._mesh.GetPoints().SetData(numpy_to_vtk(self._position))
         self._mesh.GetPointData().SetNormals(numpy_to_vtk(self._normal))
-        self._mesh.GetPointData().SetTCoords(numpy_to_vtk(self._places(n), deep=True))
+        self._mesh.GetPointData().SetTCoords(numpy_to_vtk(self._texture_coordinates(n), deep=True))
         self._mesh.SetPolys(self._triangles(n))
         mapper = vtk.vtkPolyDataMapper()
         mapper.SetInputData(self._mesh)
@@ -50,7 +50,7 @@ class Vtk:
         self._pixels = vtk.vtkUnsignedCharArray()
 
     def draw(self, position: NDArray[np.float32]) -> Picture:
-        """Refine by NumPy, draw, and read the picture, whose first row VTK has at the bottom."""
+        """Refine by NumPy, draw, and read the picture; VTK's first row is the bottom."""
         across, down = np.gradient(position, axis=1), np.gradient(position, axis=0)
         normal = self._refine(np.cross(across, -down))
         self._position[:] = self._refine(position)
@@ -70,14 +70,14 @@ class Vtk:
         return np.einsum("ai,rik->rak", self._refinement, down, optimize=True).reshape(-1, 3)
 
     @staticmethod
-    def _places(n: int) -> NDArray[np.float32]:
-        """Give the texture coordinates, v upwards; shape (vertices, 2)."""
+    def _texture_coordinates(n: int) -> NDArray[np.float32]:
+        """Return the texture coordinates, v upwards; shape (vertices, 2)."""
         along = np.linspace(0, 1, n, dtype=np.float32)
         return np.stack(np.meshgrid(along, 1 - along), axis=-1).reshape(-1, 2)
 
     @staticmethod
     def _triangles(n: int) -> vtk.vtkCellArray:
-        """Cut each small quad from its top left to its bottom right corner."""
+        """Return two triangles per quad, cut from its top left to its bottom right corner."""
         quad = np.arange(n - 1)[:, None, None] * n + np.arange(n - 1)[:, None]
         corners = np.add(quad, [0, n, n + 1, 0, n + 1, 1]).ravel()
         cells = vtk.vtkCellArray()
@@ -100,6 +100,6 @@ class Vtk:
 
 
 def prepare(problem: Problem, threads: int | None) -> Vtk:
-    """Set up the mesh; llvmpipe takes its number of threads from the environment."""
+    """Set up the mesh; llvmpipe reads the number of threads from the environment."""
     del threads
     return Vtk(problem)

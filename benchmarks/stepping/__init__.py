@@ -1,4 +1,4 @@
-"""Stepping beside other ways to write it; the first peer is this program."""
+"""Peers of the time stepping; the first is this program."""
 
 PEERS = {
     "taichi_msm": "benchmarks.stepping.msm",
@@ -10,5 +10,5 @@ PEERS = {
     "NumPy": "benchmarks.stepping.numpy_",
 }
 
-# Those that are timed at every size and with every number of threads.
+# Peers at every size and number of threads.
 FASTEST = {name: PEERS[name] for name in ("taichi_msm", "C++, OpenMP", "Numba")}

@@ -1,4 +1,4 @@
-"""C++ by hand, called through ctypes: step.cpp."""
+"""Hand-written C++, step.cpp, called through ctypes."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ FLOATS = np.ctypeslib.ndpointer(np.float32, flags="C_CONTIGUOUS")
 
 
 class Stepper(Planes):
-    """The arrays of step.cpp."""
+    """State and parameters of step.cpp."""
 
     def __init__(self, problem: Problem) -> None:
         super().__init__(problem.points)
@@ -26,13 +26,8 @@ class Stepper(Planes):
         sheet = problem.material
         self._numbers = np.array(
             [
-                *spacing(problem.scene.sheet),
-                sheet.across,
-                sheet.shear,
-                sheet.virtual,
-                problem.keep,
-                problem.gain,
-                problem.first_gain,
+                *(*spacing(problem.scene.sheet), sheet.across, sheet.shear, sheet.virtual),
+                *(problem.keep, problem.gain, problem.first_gain),
             ],
             np.float32,
         )
@@ -47,6 +42,6 @@ class Stepper(Planes):
 
 
 def prepare(problem: Problem, threads: int | None) -> Stepper:
-    """Set up the sheet at rest; OpenMP takes its number of threads from the environment."""
+    """Set up the sheet at rest; OpenMP reads the number of threads from the environment."""
     del threads
     return Stepper(problem)

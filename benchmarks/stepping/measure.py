@@ -1,4 +1,4 @@
-"""What is measured of a peer: whether its answer is right, and the time of a step."""
+"""Measurements of a stepper: correctness, and time of a step."""
 
 from __future__ import annotations
 
@@ -13,13 +13,13 @@ from benchmarks.clock import seconds
 from benchmarks.process import CACHE
 from benchmarks.stepping.problem import Problem, Stepper
 
-# Largest distance of any point from where float64 has it, as a fraction of the largest displacement. In f32 rounding
-# makes some 1e-6 of it, a spring too few or a wrong first step far more.
+# Largest error of any point, relative to the largest displacement. In f32 rounding is about 1e-6 of it; a missing
+# spring or a wrong first step is far more.
 TOLERANCE = 1e-4
 
 
 def steps_to_check(points: int) -> int:
-    """Choose how many steps are compared: the twin takes a while for a large sheet."""
+    """Return the number of steps to compare: the reference is slow for large sheets."""
     return 200 if points <= 101 else 20 if points <= 1024 else 2
 
 
@@ -29,7 +29,7 @@ def prepare(peer: str, points: int, threads: int | None) -> Stepper:
 
 
 def check(peer: str, points: int, threads: int | None = None) -> dict[str, Any]:
-    """Compare a peer with the twin, and time its start."""
+    """Compare a peer with the reference, and time its start."""
     importlib.import_module(peer)
     start = time.perf_counter()
     stepper = prepare(peer, points, threads)
@@ -41,22 +41,22 @@ def check(peer: str, points: int, threads: int | None = None) -> dict[str, Any]:
     error = _longest(stepper.displacement() - truth) / _longest(truth)
     return {
         "answer": error,
-        # Written so that NaN is wrong too.
-        "right": bool(error <= TOLERANCE),
+        # False for NaN.
+        "correct": bool(error <= TOLERANCE),
         "wanted": f"{error:.2g} from the answer in float64 after {steps} steps, of at most {TOLERANCE:g}",
         "compile": compile_seconds,
     }
 
 
 def clock(peer: str, points: int, threads: int | None = None) -> float:
-    """Time a step [s]."""
+    """Return the time of a step [s]."""
     stepper = prepare(peer, points, threads)
     stepper.advance(2)
     return seconds(stepper.advance)
 
 
 def launch(peer: str, points: int) -> float:
-    """Time a launch of one step [s]."""
+    """Return the time of a launch of one step [s]."""
     stepper = prepare(peer, points, None)
     stepper.advance(2)
 
@@ -72,9 +72,9 @@ def _longest(displacement: NDArray[Any]) -> float:
 
 
 def _answer(points: int, steps: int) -> NDArray[Any]:
-    """Take the twin's answer, once for all peers."""
-    kept = CACHE / f"answer-{points}-{steps}.npy"
-    if not kept.exists():
+    """Return the reference's displacements, computed once for all peers."""
+    cached = CACHE / f"answer-{points}-{steps}.npy"
+    if not cached.exists():
         CACHE.mkdir(parents=True, exist_ok=True)
-        np.save(kept, Problem(points).answer(steps))
-    return np.load(kept)
+        np.save(cached, Problem(points).answer(steps))
+    return np.load(cached)

@@ -1,4 +1,4 @@
-"""This program in float64, which is what twice the digits cost."""
+"""This program in float64."""
 
 from __future__ import annotations
 

@@ -1,7 +1,7 @@
-"""Numba: all steps in one function, rows shared out by prange, columns left to the compiler's vectoriser.
+"""Numba: all steps in one function, rows in parallel by prange, columns vectorised by the compiler.
 
-Coordinates are arrays of their own and a point's neighbours are read from three rows, so that every index is plain.
-Every number is a float32: one float64 among them would make all of the arithmetic one of float64.
+Coordinates are separate arrays and neighbours are read from three rows, so that every index is plain. All numbers are
+float32: a single float64 would promote all arithmetic.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from taichi_msm.model.sheet import spacing
 
 @numba.njit(fastmath=True, inline="always", cache=True)
 def pull(to_x, to_y, to_z, length, stiffness):
-    """Give the force of a spring over the vector along it."""
+    """Return the force of a spring over the vector along it."""
     return stiffness - stiffness * length / math.sqrt(to_x * to_x + to_y * to_y + to_z * to_z)
 
 
@@ -73,7 +73,7 @@ def step_row(ux, uy, uz, wx, wy, wz, share, i, load, dx, dy, diagonal, structura
 def advance(
     now, before, share, load, dx, dy, diagonal, structural, shear, virtual, keep, gain, first_gain, done, steps
 ):
-    """Take the steps; now and before, shape (3, n, n), change places after each."""
+    """Take the steps; now and before, shape (3, n, n), alternate."""
     n = share.shape[0]
     for step in range(done, done + steps):
         this_gain = gain if step else first_gain
@@ -88,7 +88,7 @@ def advance(
 
 
 class Stepper(Planes):
-    """The arrays of the compiled function."""
+    """State and parameters of the compiled function."""
 
     def __init__(self, problem: Problem) -> None:
         super().__init__(problem.points)
@@ -97,15 +97,8 @@ class Stepper(Planes):
         self._numbers = tuple(
             np.float32(number)
             for number in (
-                dx,
-                dy,
-                math.hypot(dx, dy),
-                sheet.across,
-                sheet.shear,
-                sheet.virtual,
-                problem.keep,
-                problem.gain,
-                problem.first_gain,
+                *(dx, dy, math.hypot(dx, dy), sheet.across, sheet.shear, sheet.virtual),
+                *(problem.keep, problem.gain, problem.first_gain),
             )
         )
         self._load = tuple(np.float32(force) for force in FORCE)
@@ -118,6 +111,6 @@ class Stepper(Planes):
 
 
 def prepare(problem: Problem, threads: int | None) -> Stepper:
-    """Set up the sheet at rest; Numba takes its number of threads from the environment."""
+    """Set up the sheet at rest; Numba reads the number of threads from the environment."""
     del threads
     return Stepper(problem)

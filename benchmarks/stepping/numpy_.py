@@ -1,4 +1,4 @@
-"""NumPy without temporaries: every spring once, in buffers that are made once."""
+"""NumPy without temporaries: every spring once, in preallocated buffers."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ class Stepper:
             gain = self._problem.gain if self._started else self._problem.first_gain
             self._started = True
             self._force *= np.float32(gain)
-            # u_{n+1} = u_n + keep (u_n - u_{n-1}) + gain F takes the place of u_{n-1}.
+            # u_{n+1} = u_n + keep (u_n - u_{n-1}) + gain F replaces u_{n-1}.
             self._before *= np.float32(-self._problem.keep)
             np.multiply(self._now, np.float32(1 + self._problem.keep), out=self._between)
             self._before[inner] += self._between[inner]
@@ -34,7 +34,7 @@ class Stepper:
             self._now, self._before = self._before, self._now
 
     def displacement(self) -> Array:
-        """Give the displacement, shape (n, n, 3)."""
+        """Return the displacements [m], shape (n, n, 3)."""
         return np.moveaxis(self._now, 0, -1)
 
     def _sum_forces(self) -> None:
@@ -42,9 +42,9 @@ class Stepper:
         np.multiply(self._now, np.float32(-self._problem.material.virtual), out=force)
         force += self._load
         for spring in self._problem.springs:
-            here, there = ((slice(None), *end) for end in spring.ends(points))
-            between, pull, part = self._between[here], self._square[here[1:]], self._part[here[1:]]
-            np.subtract(self._now[there], self._now[here], out=between)
+            start, end = ((slice(None), *window) for window in spring.ends(points))
+            between, pull, part = self._between[start], self._square[start[1:]], self._part[start[1:]]
+            np.subtract(self._now[end], self._now[start], out=between)
             for axis in (0, 1):
                 if spring.offset[axis]:
                     between[axis] += np.float32(spring.offset[axis])
@@ -56,11 +56,11 @@ class Stepper:
             np.divide(np.float32(-spring.stiffness * spring.length), pull, out=pull)
             pull += np.float32(spring.stiffness)
             between *= pull
-            force[here] += between
-            force[there] -= between
+            force[start] += between
+            force[end] -= between
 
 
 def prepare(problem: Problem, threads: int | None) -> Stepper:
-    """Set up the sheet at rest; NumPy takes one thread."""
+    """Set up the sheet at rest; NumPy has one thread."""
     del threads
     return Stepper(problem)

@@ -1,11 +1,11 @@
-"""Taichi as its tutorials have it: a field of vectors, one launch a step, the neighbours in a static loop."""
+"""Taichi in the style of its tutorials: a field of vectors, one launch per step, neighbours in a static loop."""
 
 # No `from __future__ import annotations` here: Taichi reads the annotations of a kernel.
 
 import taichi as ti
 
+from benchmarks.neighbours import springs
 from benchmarks.stepping.problem import Array, Problem, Stepper
-from tests.reference.neighbours import springs
 
 
 class PlainTaichi:
@@ -41,7 +41,7 @@ class PlainTaichi:
             self._gain = self._next_gain
 
     def displacement(self) -> Array:
-        """Give the displacement, shape (n, n, 3)."""
+        """Return the displacements [m], shape (n, n, 3)."""
         return self._now.to_numpy()
 
 

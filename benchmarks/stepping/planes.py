@@ -1,4 +1,4 @@
-"""The state of the peers that step in place: u_n and u_{n-1}, which take turns."""
+"""State of the peers that step in place: u_n and u_{n-1}, in two alternating buffers."""
 
 from __future__ import annotations
 
@@ -8,22 +8,18 @@ from benchmarks.stepping.problem import Array
 
 
 class Planes:
-    """A sheet at rest.
-
-    Args:
-        points: n.
-    """
+    """A sheet of n x n mass points at rest."""
 
     def __init__(self, points: int) -> None:
         self._now, self._before = (np.zeros((3, points, points), np.float32) for _ in range(2))
         self._done = 0
 
     def _count(self, steps: int) -> None:
-        """Note that steps were taken, every one into the older of the two."""
+        """Count steps, each of which overwrote the older of the two."""
         self._done += steps
         if steps % 2:
             self._now, self._before = self._before, self._now
 
     def displacement(self) -> Array:
-        """Give the displacement, shape (n, n, 3)."""
+        """Return the displacements [m], shape (n, n, 3)."""
         return np.moveaxis(self._now, 0, -1)

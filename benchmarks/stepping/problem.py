@@ -1,13 +1,13 @@
-"""The one problem that all peers step: n x n points, a fixed border, all three families of springs, a constant load.
+"""The problem of all steppers: n x n mass points, a fixed border, all three families of springs, a constant load.
 
-With u_n the displacement, F_n all forces but the damping and g = C / m, a step is (docs/model.md, central)
+With u_n the displacement, F_n all forces except damping and g = C / m, a step is (docs/model.md, central)
 
     u_{n+1} = u_n + keep (u_n - u_{n-1}) + gain F_n,    u_1 = gain_0 F_0
     keep = (1 - g h / 2) / (1 + g h / 2),  gain = h^2 / m / (1 + g h / 2),  gain_0 = h^2 / m / 2
 
-Cells are of one size whatever n is, so that every size is the same motion of single cells, and the load reaches the
-whole sheet, so that no number is so small that the processor takes its slow path. Virtual springs are stiff enough that
-nothing wrinkles, for which wrinkle comes would hang on the last digits.
+The size of cells is independent of n, and so is the motion of a single cell. The load reaches the whole sheet, so that
+there are no denormal numbers, which are slow. Stiff virtual springs prevent wrinkles, whose pattern would depend on
+rounding.
 """
 
 from __future__ import annotations
@@ -20,6 +20,7 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from benchmarks.neighbours import Spring, springs
 from taichi_msm.model.loads import decay
 from taichi_msm.model.plan import Plan
 from taichi_msm.model.sheet import Material
@@ -27,7 +28,6 @@ from taichi_msm.model.time_grid import TimeGrid
 from taichi_msm.scene.scene import Scene
 from taichi_msm.solver.planning import make_plan
 from tests import reference
-from tests.reference.neighbours import Spring, springs
 
 CELL = 0.01
 FORCE = (0.02, 0.01, -0.08)
@@ -39,28 +39,24 @@ Array = NDArray[np.float32]
 
 
 class Stepper(Protocol):
-    """A peer at rest with its problem; each module of a peer has `prepare(problem, threads)`, which makes one."""
+    """A peer's sheet, at rest at first; the module of each peer has `prepare(problem, threads)`, which returns one."""
 
     def advance(self, steps: int) -> None:
-        """Take a number of steps, and wait for their end."""
+        """Take a number of steps, and wait until they are done."""
 
     def displacement(self) -> Array:
-        """Give the displacement, shape (n, n, 3)."""
+        """Return the displacements [m], shape (n, n, 3)."""
 
 
 @dataclass(frozen=True)
 class Problem:
-    """The numbers that a peer needs.
+    """The parameters of a problem."""
 
-    Attributes:
-        points: n.
-    """
-
-    points: int
+    points: int  # n, mass points along a side
 
     @cached_property
     def scene(self) -> Scene:
-        """The problem as this program takes it."""
+        """The problem as a scene of this program."""
         side = CELL * (self.points - 1)
         return Scene.model_validate(
             {
@@ -80,12 +76,12 @@ class Problem:
 
     @property
     def grid(self) -> TimeGrid:
-        """The steps."""
+        """The time grid of the plan."""
         return self.plan.grid
 
     @property
     def material(self) -> Material:
-        """The numbers of the sheet."""
+        """The material of the plan."""
         return self.plan.material
 
     @cached_property
@@ -101,18 +97,18 @@ class Problem:
 
     @property
     def keep(self) -> float:
-        """Share of the last difference that the damping leaves."""
+        """Factor of u_n - u_{n-1} in a step."""
         drag = self._drag
         return (1 - drag) / (1 + drag)
 
     @property
     def gain(self) -> float:
-        """Displacement for a force [m/N]."""
+        """Factor of the force in a step [m/N]."""
         return self.grid.step**2 / self.material.mass / (1 + self._drag)
 
     @property
     def first_gain(self) -> float:
-        """The same of the first step."""
+        """Factor of the force in the first step [m/N]."""
         return self.grid.step**2 / self.material.mass / 2
 
     @property
@@ -120,5 +116,5 @@ class Problem:
         return self.material.drag * self.grid.step / 2
 
     def answer(self, steps: int) -> NDArray[np.float64]:
-        """Take the steps by the program's float64 twin; shape (n, n, 3)."""
+        """Return the displacements after some steps, by the NumPy reference in float64 [m], shape (n, n, 3)."""
         return next(islice(reference.displacements(self.plan), steps, None))

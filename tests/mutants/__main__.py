@@ -1,4 +1,4 @@
-"""Make one mistake at a time in a copy of the project, and see that a test fails.
+"""Make one mistake at a time in a copy of the project, and check that a test fails.
 
 python -m tests.mutants              all of them
 python -m tests.mutants richardson   some of them, by name
@@ -19,11 +19,11 @@ from tempfile import TemporaryDirectory
 
 from tests.mutants import ROOT, Mutant, mutants
 
-# What the tests of mutants need of the project.
+# Parts of the project that the tests need.
 COPIED = ("pyproject.toml", "scenes", "taichi_msm", "tests")
 
-# Longer than all the tests of all mutants take together [s].
-TIMEOUT = 1800.0
+# Longer than the tests of all mutants together [s].
+MAX_TESTS_S = 1800.0
 
 PYTEST = [sys.executable, "-m", "pytest", "-x", "-q", "--color=no", "-n", "0", "-p", "no:cacheprovider"]
 PASSED, FAILED = 0, 1
@@ -34,9 +34,9 @@ class NoVerdictError(Exception):
 
 
 def first_failure(files: Iterable[str], mutant: Mutant | None = None) -> str | None:
-    """Return the test that fails in a copy of the project with one mistake or none; None where all pass."""
+    """Return the first test that fails in a copy of the project, with a mistake if given; None if all pass."""
     with TemporaryDirectory() as directory:
-        # Resolved, as pytest tells its root: a temporary directory may be behind a link.
+        # Resolved like pytest's root: a temporary directory may be behind a link.
         copy = Path(directory).resolve()
         for name in COPIED:
             original = ROOT / name
@@ -50,14 +50,14 @@ def first_failure(files: Iterable[str], mutant: Mutant | None = None) -> str | N
             done = subprocess.run(
                 [*PYTEST, *(f"tests/{file}" for file in files)],
                 cwd=copy,
-                # Also for processes that a test starts elsewhere.
+                # Also for child processes in other directories.
                 env={**os.environ, "PYTHONPATH": str(copy)},
                 capture_output=True,
                 text=True,
-                timeout=TIMEOUT,
+                timeout=MAX_TESTS_S,
             )
         except subprocess.TimeoutExpired:
-            raise NoVerdictError(f"no end within {TIMEOUT:g} s") from None
+            raise NoVerdictError(f"no end within {MAX_TESTS_S:g} s") from None
     failure = re.search(r"^(?:FAILED|ERROR) (\S+?::\w+)", done.stdout, flags=re.MULTILINE)
     if done.returncode == FAILED and failure:
         return failure[1]
@@ -67,28 +67,28 @@ def first_failure(files: Iterable[str], mutant: Mutant | None = None) -> str | N
 
 
 def hunt(chosen: list[Mutant]) -> dict[str, str]:
-    """Find the test that kills each mutant, by its name; those that survive are left out."""
+    """Return the test that kills each mutant, by the mutant's name, without the survivors."""
 
-    def say(text: str) -> None:
+    def report(text: str) -> None:
         print(f"{time.monotonic() - start:5.0f} s  {text}", file=sys.stderr, flush=True)
 
     start = time.monotonic()
     if broken := first_failure(dict.fromkeys(file for mutant in chosen for file in mutant.tests)):
         raise NoVerdictError(f"{broken} fails without any mutant")
-    say("without a mutant all of these tests pass")
+    report("without a mutant all of these tests pass")
     killers = {}
     for mutant in chosen:
         if killer := first_failure(mutant.tests, mutant):
             killers[mutant.name] = killer
-        say(f"{mutant.name}: {f'killed by {killer}' if killer else 'SURVIVED'}")
-    say(f"{len(killers)} of {len(chosen)} killed")
+        report(f"{mutant.name}: {f'killed by {killer}' if killer else 'SURVIVED'}")
+    report(f"{len(killers)} of {len(chosen)} killed")
     return killers
 
 
 def main(arguments: list[str]) -> int:
     """Run the mutants that the command line names."""
     known = {mutant.name: mutant for mutant in mutants()}
-    parser = argparse.ArgumentParser(prog="python -m tests.mutants", description="See that tests notice mistakes.")
+    parser = argparse.ArgumentParser(prog="python -m tests.mutants", description="Check that tests notice mistakes.")
     parser.add_argument("names", nargs="*", metavar="NAME", help="all, or some of: " + ", ".join(known))
     options = parser.parse_args(arguments)
     if unknown := [name for name in options.names if name not in known]:

@@ -1,4 +1,4 @@
-"""The definitions of the package by name, and text in them, however it is indented and broken into lines."""
+"""Definitions of the package by name, and search of their text regardless of white space."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ class Definition(NamedTuple):
     source: str  # with decorators
 
     def spans(self, text: str) -> list[tuple[int, int]]:
-        """Find text in the source, whatever the white space and the commas before closing brackets."""
+        """Find text in the source, regardless of white space and of commas before closing brackets."""
         matches = _pattern(text).finditer(self.source)
         return [(self.start + match.start(), self.start + match.end()) for match in matches]
 
@@ -35,12 +35,12 @@ def definitions(root: Path, package: str) -> tuple[Definition, ...]:
 
 
 def named(name: str, known: tuple[Definition, ...]) -> list[Definition]:
-    """Choose the definitions whose qualified name is this or ends with it."""
+    """Return the definitions whose qualified name is `name` or ends with it."""
     return [definition for definition in known if f".{definition.name}".endswith(f".{name}")]
 
 
 def replaced(source: str, span: tuple[int, int], text: str) -> str:
-    """Put text in the place of a span; further lines are indented like the line in which the span begins."""
+    """Return the source with a span replaced; further lines are indented like the first line of the span."""
     begin, end = span
     line = source[source.rfind("\n", 0, begin) + 1 : begin]
     margin = line[: len(line) - len(line.lstrip())]
@@ -68,7 +68,7 @@ def _definitions(root: Path, file: Path, _changed: int) -> tuple[Definition, ...
 
 
 def _names(node: ast.AST, *, constants: bool) -> Iterator[tuple[str, slice]]:
-    """Give the names that a node defines, and its lines, counted from 0."""
+    """Yield the names that a node defines, and its lines, counted from 0."""
     if isinstance(node, ast.FunctionDef | ast.ClassDef):
         first = min((decorator.lineno for decorator in node.decorator_list), default=node.lineno)
         yield node.name, slice(first - 1, node.end_lineno)

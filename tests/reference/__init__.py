@@ -1,11 +1,10 @@
-"""The model and the picture a second time, in plain float64 NumPy, slow and simple: the kernels are tested against it.
+"""The model and the picture in plain float64 NumPy, slow and simple: the reference of the kernels.
 
-This is no independent check of the model; it is itself tested against closed forms and SciPy's integrators.
+Not an independent check of the model; it is itself tested against closed forms and against SciPy's integrators.
 """
 
 from tests.reference.drawing import draw as draw
 from tests.reference.drawing import refine as refine
-from tests.reference.dynamics import bending_force as bending_force
 from tests.reference.dynamics import displacements as displacements
 from tests.reference.dynamics import elastic_force as elastic_force
 from tests.reference.dynamics import energy as energy
@@ -19,7 +18,6 @@ from tests.reference.dynamics import tangent as tangent
 from tests.reference.rest import clearance as clearance
 from tests.reference.rest import equilibrium as equilibrium
 from tests.reference.rest import equilibrium_outside_tool as equilibrium_outside_tool
-from tests.reference.rest import place as place
 from tests.reference.rest import potential as potential
 from tests.reference.rest import stiffness as stiffness
 from tests.reference.sheet import sheet as sheet

@@ -1,4 +1,4 @@
-"""The reference for tools that are moved: contact, friction, grips and clamps, point by point."""
+"""NumPy reference of position-controlled tools: contact, friction, grips and clamps, point by point."""
 
 from __future__ import annotations
 
@@ -13,10 +13,12 @@ Array = NDArray[np.float64]
 
 
 class Contact:
-    """What the tools do to the points after each step.
+    """Corrections of positions by the tools after each step, and their forces.
 
-    `push` is by how much each probe has moved each point in the last step [m], shape (probes, rows, cols, 3), `force`
-    what it took [N], and `holder` the probe that holds each point, or -1.
+    Attributes:
+        push: displacement of each mass point by each probe in the last step [m], shape (probes, rows, cols, 3).
+        force: the mean force in that step that gives the same displacement [N], same shape.
+        holder: index of the probe that grips each mass point, or -1, shape (rows, cols).
     """
 
     def __init__(self, plan: Plan) -> None:
@@ -26,8 +28,9 @@ class Contact:
         self.push = np.zeros((len(plan.scene.probes), *shape, 3))
         self.force = np.zeros_like(self.push)
         self.holder = np.full(shape, -1)
-        self._taken = np.zeros((*shape, 3))
-        self._since = np.zeros((len(plan.scene.probes), 3))
+        # Displacement of each gripped point, and the tip's centre, at the begin of the grip.
+        self._grip_displacement = np.zeros((*shape, 3))
+        self._grip_centre = np.zeros((len(plan.scene.probes), 3))
         self._grip: dict[int, int | None] = {}
         self._clamps = [index for index, probe in enumerate(plan.scene.probes) if probe.clamp is not None]
         last_row, last_column = shape[0] - 1, shape[1] - 1
@@ -37,24 +40,33 @@ class Contact:
                 if self.holder[i, j] < 0 and sides[str(plan.scene.probes[index].clamp)]:
                     self.holder[i, j] = index
 
-    def after(self, n: int, u: Array, following: Array) -> Array:
-        """Resolve the contact in step n, which led from u to `following` [m]; returns u_{n+1}."""
+    def resolve(self, n: int, u: Array, following: Array) -> Array:
+        """Return the displacements u_{n+1} after contact [m], shape (rows, cols, 3).
+
+        A point inside a capsule goes to its surface along the normal; friction then takes back its tangential slip, by
+        at most the coefficient of friction times the penetration.
+
+        Args:
+            n: index of the step.
+            u: displacements before it, u_n [m], shape (rows, cols, 3).
+            following: displacements after it without contact [m], same shape; changed in place.
+        """
         plan, grid, h = self._plan, self._plan.grid, self._plan.grid.step
-        self._take_and_leave(n, u)
+        self._update_grips(n, u)
         for point in np.argwhere(~plan.fixed):
             i, j = point
-            held = self.holder[i, j]
+            holder = self.holder[i, j]
             for tool in plan.tools:
                 index = tool.probe
                 before, after = (tool.tip_centre(np.array([step / grid.steps_per_second]))[0] for step in (n, n + 1))
                 push = np.zeros(3)
-                if held == index and index in self._clamps:
+                if holder == index and index in self._clamps:
                     keys = np.array(plan.scene.probes[index].path)
                     t = (n + 1) / grid.steps_per_second
                     push = [np.interp(t, keys[:, 0], keys[:, 1 + axis]) for axis in range(3)] - following[i, j]
-                elif held == index:
-                    push = self._taken[i, j] + after - self._since[index] - following[i, j]
-                elif held < 0 and index not in self._clamps:
+                elif holder == index:
+                    push = self._grip_displacement[i, j] + after - self._grip_centre[index] - following[i, j]
+                elif holder < 0 and index not in self._clamps:
                     r = self._rest[i, j] + following[i, j] - after
                     r -= np.clip(r @ tool.axis, 0, tool.length) * tool.axis
                     distance = float(np.linalg.norm(r))
@@ -75,24 +87,25 @@ class Contact:
         self.force = self._mass[..., None] * self.push * weight
         return following
 
-    def _take_and_leave(self, n: int, u: Array) -> None:
+    def _update_grips(self, n: int, u: Array) -> None:
+        """End and begin grips at step n; a new grip takes free points within 1.5 radii of the tip's centre."""
         plan, grid = self._plan, self._plan.grid
-        t, equal = n / grid.steps_per_second, 1e-6 / grid.frames_per_second
-        now = {}
+        t, tolerance = n / grid.steps_per_second, 1e-6 / grid.frames_per_second
+        grips = {}
         tools = [tool for tool in plan.tools if tool.probe not in self._clamps]
         for tool in tools:
-            holds = [k for k, (begin, end) in enumerate(tool.grips) if begin - equal <= t < end - equal]
-            now[tool.probe] = holds[0] if holds else None
-        begun = [probe for probe, grip in now.items() if grip is not None and self._grip.get(probe) != grip]
-        for probe, grip in now.items():
+            active = [k for k, (begin, end) in enumerate(tool.grips) if begin - tolerance <= t < end - tolerance]
+            grips[tool.probe] = active[0] if active else None
+        begun = [probe for probe, grip in grips.items() if grip is not None and self._grip.get(probe) != grip]
+        for probe, grip in grips.items():
             if grip is None or probe in begun:
                 self.holder[self.holder == probe] = -1
         for tool in tools:
             if tool.probe in begun:
-                middle = tool.tip_centre(np.array([t]))[0]
-                near = np.linalg.norm(self._rest + u - middle, axis=-1) <= 1.5 * tool.radius
-                taken = near & ~plan.fixed & (self.holder < 0)
-                self.holder[taken] = tool.probe
-                self._taken[taken] = u[taken]
-                self._since[tool.probe] = middle
-        self._grip = now
+                centre = tool.tip_centre(np.array([t]))[0]
+                near = np.linalg.norm(self._rest + u - centre, axis=-1) <= 1.5 * tool.radius
+                gripped = near & ~plan.fixed & (self.holder < 0)
+                self.holder[gripped] = tool.probe
+                self._grip_displacement[gripped] = u[gripped]
+                self._grip_centre[tool.probe] = centre
+        self._grip = grips

@@ -1,4 +1,8 @@
-"""The reference for the model: its forces and its steps."""
+"""NumPy reference of the model: forces, energy, tangent and time stepping.
+
+Equation numbers are those of Yuan et al. 2009. `assembled` is a sheet to use in place of the scene's own; its numbers
+may be complex, for derivatives by a complex step.
+"""
 
 from __future__ import annotations
 
@@ -20,30 +24,45 @@ from tests.reference.sheet import Sheet, Springs, sheet
 Array = NDArray[np.float64]
 
 
-def elastic_force(scene: Scene, displacement: Array, made: Sheet | None = None) -> Array:
-    """Sum k (L - L0) (Q - P) / L over the neighbours Q of every point P (eq. 2), without the part that cancels at rest.
+def elastic_force(scene: Scene, displacement: Array, assembled: Sheet | None = None) -> Array:
+    """Return the force of structural and shear springs [N], shape (rows, cols, 3).
 
-    Of displacements x - X [m], shape (rows, cols, 3), and of another sheet than the scene's, numbers may be complex.
+    The sum of k (L - L0) (Q - P) / L over the neighbours Q of every point P (eq. 2), less its value at rest, where the
+    forces of a sheet under tension cancel. Stiffening tissue has `lock` of the strain in place of the strain.
+
+    Args:
+        scene: scene with springs or tissue.
+        displacement: u = x - X [m], shape (rows, cols, 3), real or complex.
+        assembled: another sheet than the scene's.
     """
-    every = (made or sheet(scene)).springs
+    every = (assembled or sheet(scene)).springs
     force = np.zeros(displacement.shape, np.result_type(displacement, *(springs.unstretched for springs in every)))
     for springs in every:
         between, length = _ends_apart(springs, displacement)
         pull = (length - springs.unstretched) / np.where(length == 0, 1, length)
-        found = (springs.stiffness * pull)[..., None] * between
+        tension = (springs.stiffness * pull)[..., None] * between
         at_rest = springs.stiffness * (springs.length - springs.unstretched) / springs.length
-        found -= at_rest[..., None] * springs.offset
+        tension -= at_rest[..., None] * springs.offset
         if scene.tissue is not None and scene.tissue.stiffening is not None:
             keys, strain = scene.tissue.stiffening, length / springs.length - 1
             more = springs.stiffness * springs.length * (lock(strain, keys.lock, keys.factor) - strain)
-            found += (more / length)[..., None] * between
-        force[springs.here] += found
-        force[springs.there] -= found
+            tension += (more / length)[..., None] * between
+        force[springs.start] += tension
+        force[springs.end] -= tension
     return force
 
 
 def lock(e: Array, m: float, factor: float) -> Array:
-    """Return the law of tissue that locks: e / (1 - e / m) where e > 0, straight where its slope reaches the factor."""
+    """Return the strain that the law of stiffening tissue has in place of e.
+
+    e / (1 - e / m) where e > 0, and e where it is negative; beyond the strain at which the slope reaches `factor` the
+    law goes on straight.
+
+    Args:
+        e: strain, of any shape.
+        m: locking strain.
+        factor: largest slope, that is the ratio of the largest stiffness to that at rest.
+    """
     c = m * (1 - factor**-0.5)
     curved = np.where(e > 0, e / (1 - np.clip(e, 0, c) / m), e)
     return np.where(e > c, c / (1 - c / m) + (e - c) * factor, curved)
@@ -57,9 +76,17 @@ def _integral(e: Array, m: float, factor: float) -> Array:
     return np.asarray(curved + beyond * (c / (1 - c / m) - c) + (factor - 1) * beyond**2 / 2)
 
 
-def foundation_force(scene: Scene, displacement: Array, made: Sheet | None = None) -> Array:
-    """Return the force of the virtual springs while they are active [N], shape (rows, cols, 3)."""
-    k = (made or sheet(scene)).virtual
+def foundation_force(scene: Scene, displacement: Array, assembled: Sheet | None = None) -> Array:
+    """Return the force of the virtual springs while they are active [N], shape (rows, cols, 3).
+
+    -K u (eq. 4), with `lock` of the depth -u_z where the foundation locks.
+
+    Args:
+        scene: scene with virtual springs or a foundation.
+        displacement: u [m], shape (rows, cols, 3).
+        assembled: another sheet than the scene's.
+    """
+    k = (assembled or sheet(scene)).virtual
     force = -k[..., None] * displacement
     foundation = None if scene.tissue is None else scene.tissue.foundation
     if isinstance(foundation, Foundation) and foundation.lock is not None:
@@ -69,20 +96,28 @@ def foundation_force(scene: Scene, displacement: Array, made: Sheet | None = Non
 
 
 def _ends_apart(springs: Springs, displacement: Array) -> tuple[Array, Array]:
-    """Give the vectors from one end of each spring to the other, and their lengths [m]."""
-    between = displacement[springs.there] - displacement[springs.here] + springs.offset
+    """Return the vectors from one end of each spring to the other, and their lengths [m]."""
+    between = displacement[springs.end] - displacement[springs.start] + springs.offset
     return between, np.sqrt((between**2).sum(axis=-1))
 
 
 def _laplacian(scene: Scene, u: Array) -> Array:
-    """Give the five-point Laplacian at the points that have four neighbours [1/m]."""
+    """Return the five-point Laplacian at the points that have four neighbours [1/m]."""
     (dx, dy), inner = spacing(scene.sheet), u[1:-1, 1:-1]
     return (u[1:-1, 2:] - 2 * inner + u[1:-1, :-2]) / dx**2 + (u[2:, 1:-1] - 2 * inner + u[:-2, 1:-1]) / dy**2
 
 
-def bending_force(scene: Scene, displacement: Array, made: Sheet | None = None) -> Array:
-    """Differentiate D / 2 sum of dx dy |Laplacian of u|^2 over the points with four neighbours; as `elastic_force`."""
-    (dx, dy), moment = spacing(scene.sheet), (made or sheet(scene)).bending * _laplacian(scene, displacement)
+def bending_force(scene: Scene, displacement: Array, assembled: Sheet | None = None) -> Array:
+    """Return the force of plate bending [N], shape (rows, cols, 3).
+
+    The negative gradient of D / 2 sum of dx dy |Laplacian of u|^2 over the points with four neighbours.
+
+    Args:
+        scene: scene with springs or tissue.
+        displacement: u [m], shape (rows, cols, 3), real or complex.
+        assembled: another sheet than the scene's.
+    """
+    (dx, dy), moment = spacing(scene.sheet), (assembled or sheet(scene)).bending * _laplacian(scene, displacement)
     force = np.zeros(displacement.shape, moment.dtype)
     force[1:-1, 1:-1] += (2 / dx**2 + 2 / dy**2) * moment
     force[1:-1, 2:] -= moment / dx**2
@@ -93,12 +128,22 @@ def bending_force(scene: Scene, displacement: Array, made: Sheet | None = None) 
 
 
 def shortest_spring(scene: Scene, displacement: Array) -> float:
-    """Find the smallest ratio of a spring's length to that at rest; 1 if there are no springs."""
+    """Return the smallest ratio of a spring's length to that at rest, at most 1.
+
+    Args:
+        scene: scene whose springs are measured, except those without stiffness.
+        displacement: u [m], shape (rows, cols, 3).
+    """
     return min(1.0, *(float(strain.min(initial=1.0)) for strain in _strains(scene, displacement)))
 
 
 def longest_spring(scene: Scene, displacement: Array) -> float:
-    """Find how far the springs are stretched, as `shortest_spring` does."""
+    """Return the largest ratio of a spring's length to that at rest, at least 1.
+
+    Args:
+        scene: scene whose springs are measured, except those without stiffness.
+        displacement: u [m], shape (rows, cols, 3).
+    """
     return max(1.0, *(float(strain.max(initial=1.0)) for strain in _strains(scene, displacement)))
 
 
@@ -108,26 +153,38 @@ def _strains(scene: Scene, displacement: Array) -> Iterator[Array]:
 
 
 def energy(scene: Scene, displacement: Array) -> float:
-    """Give the elastic energy of springs and bending above that at rest [J], without the virtual springs."""
-    made = sheet(scene)
-    held = made.bending / 2 * float((_laplacian(scene, displacement) ** 2).sum())
-    for springs in made.springs:
+    """Return the elastic energy of springs and bending above that at rest [J], without the virtual springs.
+
+    The sum of k ((L - L0)^2 - (L_rest - L0)^2) / 2, less the part linear in u, and of D / 2 |Laplacian|^2 dx dy.
+
+    Args:
+        scene: scene with springs or tissue.
+        displacement: u [m], shape (rows, cols, 3).
+    """
+    assembled = sheet(scene)
+    total = assembled.bending / 2 * float((_laplacian(scene, displacement) ** 2).sum())
+    for springs in assembled.springs:
         between, length = _ends_apart(springs, displacement)
         rest = springs.length - springs.unstretched
         # The part that is linear in the displacements cancels in the sum, as the sheet is in equilibrium at rest.
         linear = (between - springs.offset) @ springs.offset * rest / springs.length
         strained = (length - springs.unstretched) ** 2 / 2 - rest**2 / 2 - linear
-        held += float((springs.stiffness * strained).sum())
+        total += float((springs.stiffness * strained).sum())
         if scene.tissue is not None and scene.tissue.stiffening is not None:
             keys, strain = scene.tissue.stiffening, length / springs.length - 1
-            held += float((springs.stiffness * springs.length**2 * _integral(strain, keys.lock, keys.factor)).sum())
-    return held
+            total += float((springs.stiffness * springs.length**2 * _integral(strain, keys.lock, keys.factor)).sum())
+    return total
 
 
 def surgical_force(scene: Scene, loads: Schedule, n: int) -> Array:
-    """Sum the forces of probes in row n of a schedule [N], shape (rows, cols, 3).
+    """Return the sum of the forces of probes [N], shape (rows, cols, 3).
 
-    They are (percent / 100) force exp(-falloff d - offset) (eq. 5), or shares of their totals.
+    Of each, (percent / 100) force exp(-falloff d - offset) (eq. 5), or its total shared by exp(-falloff d).
+
+    Args:
+        scene: scene with force-controlled tools.
+        loads: schedule of loads and control points, a row for every step or time.
+        n: row of the schedule.
     """
     rest = rest_positions(scene.sheet)
     force = np.zeros_like(rest)
@@ -144,22 +201,45 @@ def surgical_force(scene: Scene, loads: Schedule, n: int) -> Array:
     return force
 
 
-def force(scene: Scene, displacement: Array, loads: Schedule, n: int, made: Sheet | None = None) -> Array:
-    """Add up all forces except the damping at one step (eq. 1), row n of the schedule; as `elastic_force`."""
-    made = made or sheet(scene)
-    springs = elastic_force(scene, displacement, made) + bending_force(scene, displacement, made)
+def force(scene: Scene, displacement: Array, loads: Schedule, n: int, assembled: Sheet | None = None) -> Array:
+    """Return the sum of all forces except damping (eq. 1) [N], shape (rows, cols, 3).
+
+    Args:
+        scene: scene with springs or tissue.
+        displacement: u [m], shape (rows, cols, 3), real or complex.
+        loads: schedule of loads and of the activity of virtual springs.
+        n: row of the schedule.
+        assembled: another sheet than the scene's.
+    """
+    assembled = assembled or sheet(scene)
+    springs = elastic_force(scene, displacement, assembled) + bending_force(scene, displacement, assembled)
     # In this order small sheets stay within the roundings of their steps.
-    return springs + surgical_force(scene, loads, n) + loads.active[n] * foundation_force(scene, displacement, made)
+    return (
+        springs + surgical_force(scene, loads, n) + loads.active[n] * foundation_force(scene, displacement, assembled)
+    )
 
 
-def internal_force(scene: Scene, displacement: Array, loads: Schedule, n: int, made: Sheet) -> Array:
-    """Add up the forces of springs, bending and foundation [N], shape (rows, cols, 3)."""
-    springs = elastic_force(scene, displacement, made) + bending_force(scene, displacement, made)
-    return springs + loads.active[n] * foundation_force(scene, displacement, made)
+def internal_force(scene: Scene, displacement: Array, loads: Schedule, n: int, assembled: Sheet) -> Array:
+    """Return the sum of the forces of springs, bending and foundation [N], shape (rows, cols, 3).
+
+    Args:
+        scene: scene with springs or tissue.
+        displacement: u [m], shape (rows, cols, 3).
+        loads: schedule of the activity of virtual springs.
+        n: row of the schedule.
+        assembled: assembled sheet of the scene, or another one.
+    """
+    springs = elastic_force(scene, displacement, assembled) + bending_force(scene, displacement, assembled)
+    return springs + loads.active[n] * foundation_force(scene, displacement, assembled)
 
 
 class Relaxation:
-    """The memory of tissue that relaxes, h [s] apart."""
+    """Viscoelastic memory of tissue: a Prony series, integrated exactly for forces that are linear within a step.
+
+    Args:
+        scene: the scene; its tissue's `relaxation` has the branches' shares and times [s].
+        h: time step [s].
+    """
 
     def __init__(self, scene: Scene, h: float) -> None:
         branches = () if scene.tissue is None else scene.tissue.relaxation
@@ -167,7 +247,7 @@ class Relaxation:
         self._memory: list[Any] = [0.0 for _ in branches]
 
     def step(self, elastic: Array) -> Array:
-        """Return the force that acts in place of the elastic force, which becomes part of the memory."""
+        """Return the relaxed force [N], and add the elastic force [N] of this step to the memory."""
         total = (1 - sum(share for share, _ in self._branches)) * elastic
         for n, (share, x) in enumerate(self._branches):
             phi = (1 - np.exp(-x)) / x
@@ -176,25 +256,35 @@ class Relaxation:
         return total
 
     def begin(self, elastic: Array) -> None:
-        """Remember a load that was put on at frame 0 of a scene at rest."""
+        """Set the memory to the history of a load [N] applied at frame 0 of a quasi-static scene."""
         for n, (share, x) in enumerate(self._branches):
             self._memory[n] = share * (np.exp(-x) - (1 - np.exp(-x)) / x) * elastic
 
 
-def tangent(scene: Scene, displacement: Array, change: Array, active: float = 1.0, made: Sheet | None = None) -> Array:
-    """Give the change of all forces but those of the probes with a small change of the displacements [N].
+def tangent(
+    scene: Scene, displacement: Array, change: Array, active: float = 1.0, assembled: Sheet | None = None
+) -> Array:
+    """Return the change of springs', bending and foundation forces with the displacements [N], shape (rows, cols, 3).
 
-    Of the virtual springs a share is active; `made` is the scene's sheet, where it is known.
+    Of a spring with the unit vector n, k ((1 - L0 / L) I + L0 / L n n^T) times the change of its vector; of laws that
+    lock, the linear part alone.
+
+    Args:
+        scene: scene with springs or tissue.
+        displacement: u [m], shape (rows, cols, 3).
+        change: direction du [m], same shape.
+        active: share of the virtual springs that are active, 0 to 1.
+        assembled: another sheet than the scene's.
     """
-    made = made or sheet(scene)
-    total = bending_force(scene, change, made) - active * made.virtual[..., None] * change
-    for springs in made.springs:
+    assembled = assembled or sheet(scene)
+    total = bending_force(scene, change, assembled) - active * assembled.virtual[..., None] * change
+    for springs in assembled.springs:
         between, length = _ends_apart(springs, displacement)
-        apart, slack = change[springs.there] - change[springs.here], (springs.unstretched / length)[..., None]
-        turned = ((between * apart).sum(axis=-1) / length**2)[..., None] * between
-        pull = springs.stiffness[..., None] * ((1 - slack) * apart + slack * turned)
-        total[springs.here] += pull
-        total[springs.there] -= pull
+        apart, slack = change[springs.end] - change[springs.start], (springs.unstretched / length)[..., None]
+        along = ((between * apart).sum(axis=-1) / length**2)[..., None] * between
+        pull = springs.stiffness[..., None] * ((1 - slack) * apart + slack * along)
+        total[springs.start] += pull
+        total[springs.end] -= pull
     return total
 
 
@@ -203,26 +293,32 @@ def displacements(plan: Plan) -> Iterator[Array]:
     return (u for u, _ in steps(plan))
 
 
-def steps(plan: Plan, made: Sheet | None = None) -> Iterator[tuple[Array, Contact]]:
+def steps(plan: Plan, assembled: Sheet | None = None) -> Iterator[tuple[Array, Contact]]:
     """Yield u_0, u_1, ... [m], shape (rows, cols, 3), each with the contact in the step before it.
 
-    made: another sheet than the scene's, as for `elastic_force`.
+    Stoermer-Verlet with central damping, (1 + g h / 2) u_{n+1} = 2 u_n - (1 - g h / 2) u_{n-1} + h^2 a_n, or with
+    backward damping, u_{n+1} = 2 u_n - u_{n-1} + h^2 a_n - g h (u_n - u_{n-1}) (eq. 6 to 9); u_1 = h^2 a_0 / 2. Of
+    order 2, and of order 1 with backward damping.
+
+    Args:
+        plan: plan of a scene, with its time step.
+        assembled: another sheet than the scene's.
     """
     scene = plan.scene
-    h, made = plan.grid.step, made or sheet(scene)
-    m, g = made.mass[..., None], (made.drag / made.mass)[..., None]
+    h, assembled = plan.grid.step, assembled or sheet(scene)
+    m, g = assembled.mass[..., None], (assembled.drag / assembled.mass)[..., None]
     moves, contact = ~plan.fixed[..., None], Contact(plan)
     loads, relaxation = average_loads(plan, 0, plan.grid.steps), Relaxation(scene, h)
 
     def acceleration(u: Array, n: int) -> Array:
         if scene.tissue is None or not scene.tissue.relaxation:
-            return np.asarray(force(scene, u, loads, n, made) / m)
-        elastic = internal_force(scene, u, loads, n, made)
+            return np.asarray(force(scene, u, loads, n, assembled) / m)
+        elastic = internal_force(scene, u, loads, n, assembled)
         return np.asarray((relaxation.step(elastic) + surgical_force(scene, loads, n)) / m)
 
     previous = np.zeros((*scene.sheet.points, 3))
     yield previous, contact
-    current = contact.after(0, previous, h**2 / 2 * acceleration(previous, 0) * moves)
+    current = contact.resolve(0, previous, h**2 / 2 * acceleration(previous, 0) * moves)
     yield current, contact
     for n in range(1, len(loads.active)):
         a = acceleration(current, n)
@@ -230,12 +326,12 @@ def steps(plan: Plan, made: Sheet | None = None) -> Iterator[tuple[Array, Contac
             following = (2 * current - (1 - g * h / 2) * previous + h**2 * a) / (1 + g * h / 2)
         else:
             following = 2 * current - previous + h**2 * a - g * h * (current - previous)
-        previous, current = current, contact.after(n, current, following * moves)
+        previous, current = current, contact.resolve(n, current, following * moves)
         yield current, contact
 
 
 def simulate(scene: Scene) -> Array:
-    """Run the whole scene and give the positions of every frame [m], shape (F + 1, rows, cols, 3)."""
+    """Return the positions of every frame of a scene [m], shape (frames + 1, rows, cols, 3)."""
     plan = make_plan(scene)
     frames = [u for n, u in enumerate(displacements(plan)) if n % plan.grid.steps_per_frame == 0]
     return rest_positions(scene.sheet) + np.array(frames)

@@ -1,4 +1,4 @@
-"""The reference for rough tools at rest: SciPy's equilibria, and what sticks to a tool between them, point by point."""
+"""NumPy reference of rough tools in equilibrium: SciPy's equilibria, and sticking points found one by one."""
 
 from __future__ import annotations
 
@@ -11,15 +11,24 @@ from scipy.optimize import brentq, minimize_scalar
 from taichi_msm.model.loads import evaluate_frame_loads
 from taichi_msm.model.plan import Plan
 from tests.reference.dynamics import force
-from tests.reference.rest import away, clearance, equilibrium
+from tests.reference.rest import clearance, equilibrium, outward
 
 Array = NDArray[np.float64]
 
 
 def rough_frames(plan: Plan, start: Array) -> Iterator[tuple[Array, Array, NDArray[np.bool_]]]:
-    """Give the displacements at each frame, the force of the only tool, and what sticks to it, of a sheet at `start`.
+    """Simulate a quasi-static scene with one rough tool.
 
-    Each frame is one shape, which the sheet reaches without touching the tool elsewhere.
+    Between two frames the free points move on straight lines to the equilibrium without contact; one that meets the
+    tool sticks to it from there. Afterwards stuck points that the tool pulls are let go, the strongest pulls first.
+
+    Args:
+        plan: plan of the scene.
+        start: displacements at frame 0 [m], shape (rows, cols, 3).
+
+    Yields:
+        For each further frame, displacements [m], shape (rows, cols, 3); the tool's force [N], shape (3,); and the
+        stuck points, shape (rows, cols).
     """
     u, stuck, anchor = start, np.zeros(plan.fixed.shape, dtype=bool), np.zeros_like(start)
     rate = plan.grid.frames_per_second
@@ -38,7 +47,7 @@ def rough_frames(plan: Plan, start: Array) -> Iterator[tuple[Array, Array, NDArr
         while True:
             u = equilibrium(plan, loads, np.where(stuck[..., None], anchor + after, untouched), stuck)
             others = force(plan.scene, u, loads, 0)
-            pulls = np.where(stuck, (others * away(plan, u, times[1])[0]).sum(axis=-1), 0)
+            pulls = np.where(stuck, (others * outward(plan, u, times[1])[0]).sum(axis=-1), 0)
             if pulls.max() <= 1e-7 * np.abs(others).max():
                 break
             stuck = stuck & (pulls <= pulls.max() / 2)
@@ -53,7 +62,7 @@ def _centre(plan: Plan, time: float) -> Array:
 def _first_touch(
     plan: Plan, before: Array, after: Array, point: tuple[int, int], times: tuple[float, float]
 ) -> float | None:
-    """Find the share of the way at which a point comes within the tool, whose clearance is convex along the way."""
+    """Return the share of the stride at which a point meets the tool; its clearance is convex along the stride."""
 
     def gap(share: float) -> float:
         u = before + share * (after - before)

@@ -1,4 +1,4 @@
-"""The reference for the colours of the picture: the texture, and the light on tissue and on metal."""
+"""NumPy reference of the picture's colours: texture filtering, and the light on tissue and on metal."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ Array = NDArray[np.float64]
 
 
 def normals(position: Array) -> Array:
-    """Give unit normals, toward the viewer at rest, from central differences, one-sided ones at the edges."""
+    """Return unit normals of mass points, toward +z at rest, shape (rows, cols, 3), from central differences."""
     right = np.gradient(position, axis=1)
     up = -np.gradient(position, axis=0)
     normal = np.cross(right, up)
@@ -26,24 +26,38 @@ def normals(position: Array) -> Array:
 
 
 def normals_at(normal: Array, u: Array, v: Array) -> Array:
-    """Interpolate normals bilinearly between mass points at fractions u of the width and v of the height."""
-    place = [v * (normal.shape[0] - 1), u * (normal.shape[1] - 1)]
-    i, j = (np.clip(np.floor(p).astype(int), 0, count - 2) for p, count in zip(place, normal.shape, strict=False))
-    s, t = (place[1] - j)[..., None], (place[0] - i)[..., None]
+    """Return normals, bilinear between mass points and of any length, shape (*u.shape, 3).
+
+    Args:
+        normal: normals of the mass points, shape (rows, cols, 3).
+        u: fraction of the sheet's width, from its left.
+        v: fraction of the sheet's height, from its top, same shape.
+    """
+    index = [v * (normal.shape[0] - 1), u * (normal.shape[1] - 1)]
+    i, j = (np.clip(np.floor(x).astype(int), 0, count - 2) for x, count in zip(index, normal.shape, strict=False))
+    s, t = (index[1] - j)[..., None], (index[0] - i)[..., None]
     upper = normal[i, j] * (1 - s) + normal[i, j + 1] * s
     lower = normal[i + 1, j] * (1 - s) + normal[i + 1, j + 1] * s
     return upper * (1 - t) + lower * t
 
 
 def headlight(normal: Array, toward: Array) -> Array:
-    """Give the cosine between the unit vector toward the light and normals of any length, 0 to 1."""
+    """Return the cosine between the unit vector `toward` the light and normals of any length, 0 to 1.
+
+    Args:
+        normal: normals, shape (..., 3).
+        toward: unit vector toward the light, shape (3,).
+    """
     return np.asarray(np.abs(normal @ toward) / np.maximum(np.linalg.norm(normal, axis=-1), 1e-30))
 
 
 def sample(texture: NDArray[np.uint8], u: Array, v: Array) -> Array:
-    """Filter the texture bilinearly, clamped at its edge, at fractions u of the width and v of the height; 0 to 255.
+    """Return colours of a texture, bilinear and clamped at its edge, 0 to 255, shape (*u.shape, 3).
 
-    Texel (a, b) has its centre at ((a + 1/2)/w, (b + 1/2)/h).
+    Args:
+        texture: colours, shape (height, width, 3); texel (a, b) has its centre at ((a + 1/2)/width, (b + 1/2)/height).
+        u: fraction of the width, from the left.
+        v: fraction of the height, from the top, same shape.
     """
     height, width, _ = texture.shape
     x, y = u * width - 0.5, v * height - 0.5
@@ -58,7 +72,7 @@ def sample(texture: NDArray[np.uint8], u: Array, v: Array) -> Array:
     return upper * (1 - down) + lower * down
 
 
-def mean_of_fours(texture: NDArray[np.uint8]) -> NDArray[np.uint8]:
+def _halved(texture: NDArray[np.uint8]) -> NDArray[np.uint8]:
     """Halve a texture: each texel is the rounded mean of 2 x 2; beyond an edge, the texels at the edge are repeated."""
     rows, cols = (np.minimum(np.arange(size + size % 2), size - 1) for size in texture.shape[:2])
     even = texture[rows][:, cols].astype(float)
@@ -67,34 +81,42 @@ def mean_of_fours(texture: NDArray[np.uint8]) -> NDArray[np.uint8]:
 
 
 def minified(texture: NDArray[np.uint8], u: Array, v: Array, footprint: Array) -> tuple[Array, Array]:
-    """Filter a texture for samples each of which may show many of its texels, at places as for `sample`.
+    """Filter a texture trilinearly (mipmap) for samples that each cover many texels.
 
-    Gives colours, shape (*u.shape, 3), and the slope of the grey per texel to the right and down, shape (*u.shape, 2).
+    Args:
+        texture: colours, shape (height, width, 3).
+        u: fraction of the width, as for `sample`.
+        v: fraction of the height.
+        footprint: larger of a sample's width and height, in units of uniforms.FULL_RESOLUTION_TEXELS, same shape.
+
+    Returns:
+        Colours, shape (*u.shape, 3), and the gradient of the grey to the right and down [grey / texel], shape
+        (*u.shape, 2).
     """
     levels = [texture]
     while levels[-1].shape[:2] != (1, 1):
-        levels.append(mean_of_fours(levels[-1]))
+        levels.append(_halved(levels[-1]))
     lower = np.floor(np.log2(np.maximum(footprint, 1))).astype(int)
     share = np.clip(footprint / 2.0**lower - 1, 0, 1)[..., None]
     height, width, _ = texture.shape
-    # Every level is filtered at the places of all samples; a texel of a halved level begins where its first half does.
+    # Every level is filtered for all samples; a texel of a halved level begins where its first half does.
     colours, rises = [], []
     for n, level in enumerate(levels):
         across, down = u * width / 2**n / level.shape[1], v * height / 2**n / level.shape[0]
         colours.append(sample(level, across, down))
-        rises.append(rise(level, across, down) / 2**n)
+        rises.append(_grey_gradient(level, across, down) / 2**n)
     last = len(levels) - 1
-    found = []
+    filtered = []
     for values in (np.array(colours), np.array(rises)):
-        near, far = (
+        fine, coarse = (
             np.take_along_axis(values, np.minimum(lower + more, last)[None, ..., None], axis=0)[0] for more in (0, 1)
         )
-        found.append(near + (far - near) * share)
-    return found[0], found[1]
+        filtered.append(fine + (coarse - fine) * share)
+    return filtered[0], filtered[1]
 
 
-def rise(texture: NDArray[np.uint8], u: Array, v: Array) -> Array:
-    """Differentiate the filtered grey of a texture to the right and down [grey / texel], shape (*u.shape, 2)."""
+def _grey_gradient(texture: NDArray[np.uint8], u: Array, v: Array) -> Array:
+    """Differentiate the bilinear grey of a texture to the right and down [grey / texel], shape (*u.shape, 2)."""
     height, width, _ = texture.shape
     x, y = np.clip(u * width - 0.5, 0, width - 1), np.clip(v * height - 0.5, 0, height - 1)
     a, b = np.floor(x).astype(int), np.floor(y).astype(int)
@@ -105,15 +127,19 @@ def rise(texture: NDArray[np.uint8], u: Array, v: Array) -> Array:
     return np.stack([to_right, down], axis=-1)
 
 
-def unit(vector: Array) -> Array:
+def _unit(vector: Array) -> Array:
     """Scale vectors to length 1, shape (..., 3)."""
     return np.asarray(vector / np.maximum(np.linalg.norm(vector, axis=-1, keepdims=True), 1e-30))
 
 
 def points(camera: View, factor: int, depth: Array) -> Array:
-    """Find the points in space that the samples of a picture show [m], at depths along the direction of view [m].
+    """Return the points in space that samples show [m], shape (height, width, 3).
 
-    Where nothing is seen, the values have no meaning; `factor` samples a pixel and axis.
+    Args:
+        camera: view to draw from.
+        factor: samples per pixel and axis.
+        depth: depth along the direction of view [m], shape (height, width) in samples; infinite where there is nothing,
+            and the returned values are meaningless.
     """
     right, up, toward = camera.axes
     y, x = (np.mgrid[: depth.shape[0], : depth.shape[1]] + 0.5) / factor
@@ -126,23 +152,36 @@ def points(camera: View, factor: int, depth: Array) -> Array:
 
 
 def illuminate(camera: View, factor: int, depth: Array, normal: Array) -> tuple[Array, Array, Array, Array]:
-    """Find the vectors in space that decide how the samples of a picture are lit; arguments as for `points`.
+    """Compute the vectors of the lighting model.
 
-    They are the normal and the directions to the light and to the eye; and, over the distance of the light from the
-    sample, that from the middle of the main camera's picture.
+    Args:
+        camera: view to draw from.
+        factor: samples per pixel and axis.
+        depth: as for `points` [m], shape (height, width).
+        normal: normals of any length, shape (height, width, 3).
+
+    Returns:
+        Unit normals, unit vectors to the light and to the eye, shape (height, width, 3); and the light's distance from
+        the middle of the main camera's picture over that from the sample, at most 4, shape (height, width).
     """
     light_view = camera.light_view or camera
     right, up, toward = light_view.axes
     point = points(camera, factor, depth)
     light = light_view.eye + light_view.distance * (uniforms.LIGHT_RIGHT * right + uniforms.LIGHT_UP * up)
-    to_eye = unit(camera.eye - point) if camera.pinhole else np.broadcast_to(camera.axes[2], point.shape)
+    to_eye = _unit(camera.eye - point) if camera.pinhole else np.broadcast_to(camera.axes[2], point.shape)
     middle = np.linalg.norm(light - (light_view.eye - light_view.distance * toward))
     nearness = np.minimum(middle / np.linalg.norm(light - point, axis=-1), 4)
-    return unit(normal), unit(light - point), to_eye, nearness
+    return _unit(normal), _unit(light - point), to_eye, nearness
 
 
 def highlight(normal: Array, to_light: Array, to_eye: Array) -> Array:
-    """Give the highlight of Phong's model, 0 to 1."""
+    """Return the highlight of Phong's model, (r . e)^(2^SHARPNESS) with the mirrored light r, 0 to 1.
+
+    Args:
+        normal: unit normals, shape (..., 3).
+        to_light: unit vectors toward the light, same shape.
+        to_eye: unit vectors toward the eye, same shape.
+    """
     mirrored = 2 * (normal * to_light).sum(axis=-1, keepdims=True) * normal - to_light
     return np.asarray(np.clip((mirrored * to_eye).sum(axis=-1), 0, 1) ** 2**uniforms.SHARPNESS)
 
@@ -153,16 +192,26 @@ def tissue(
     texture: NDArray[np.uint8],
     normal: Array,
     depth: Array,
-    place: tuple[Array, Array, Array],
+    texel: tuple[Array, Array, Array],
     rods: Sequence[Solid],
 ) -> Array:
-    """Shade wet tissue, as `render/shading.py`; `place` has the arguments of `minified`."""
+    """Return the colours of wet tissue, 0 to 255, shape (height, width, 3), by the formulas of `render/shading.py`.
+
+    Args:
+        scene: scene with the light and the sheet.
+        camera: view to draw from.
+        texture: colours, shape (height, width, 3).
+        normal: normals of any length, shape (height, width, 3).
+        depth: as for `points` [m], shape (height, width).
+        texel: u, v and footprint for `minified`, each of shape (height, width).
+        rods: instruments, which darken the tissue around them.
+    """
     light, factor = scene.render.light, scene.render.supersample
-    colour, rises = minified(texture, *place)
+    colour, rises = minified(texture, *texel)
     # Where the relief rises, the normal tilts back, along the sheet.
     upward = light.relief / 100 * max(scene.sheet.size) / 255
     sizes = texture.shape[1] / scene.sheet.size[1], texture.shape[0] / scene.sheet.size[0]
-    normal = unit(normal)
+    normal = _unit(normal)
     slope = np.concatenate([rises * upward * sizes * (1, -1), np.zeros_like(rises[..., :1])], axis=-1)
     leaning = normal - slope + (slope * normal).sum(axis=-1, keepdims=True) * normal
     facing, to_light, to_eye, nearness = illuminate(camera, factor, depth, leaning)
@@ -172,9 +221,9 @@ def tissue(
     share = light.ambient + (1 - light.ambient) * wrapped
     gloss = 255 * light.gloss * highlight(facing, to_light, to_eye) * nearness
     for rod in rods:
-        away = points(camera, factor, depth) - rod.tip
-        foot = np.clip(away @ rod.axis, 0, rod.length)[..., None] * rod.axis
-        ratio = np.maximum(np.linalg.norm(away - foot, axis=-1) / rod.radius, 1)
+        offset = points(camera, factor, depth) - rod.tip
+        foot = np.clip(offset @ rod.axis, 0, rod.length)[..., None] * rod.axis
+        ratio = np.maximum(np.linalg.norm(offset - foot, axis=-1) / rod.radius, 1)
         share, gloss = (value * (1 - uniforms.SHADE / ratio**2) for value in (share, gloss))
     y, x = (np.mgrid[: depth.shape[0], : depth.shape[1]] + 0.5) / factor
     middle = camera.size / 2
@@ -184,9 +233,16 @@ def tissue(
 
 
 def metal(camera: View, factor: int, depth: Array, normal: Array) -> Array:
-    """Shade metal, which reflects a room that is bright above and dark below; colours, shape (height, width, 3)."""
-    far = (camera.light_view or camera).distance * np.hypot(1, np.hypot(uniforms.LIGHT_RIGHT, uniforms.LIGHT_UP))
-    below = np.maximum(np.where(np.isfinite(depth), depth, far), uniforms.METAL_NEAREST * far)
+    """Return the colours of metal in a room that is bright above and dark below, 0 to 255, shape (height, width, 3).
+
+    Args:
+        camera: view to draw from.
+        factor: samples per pixel and axis.
+        depth: as for `points` [m], shape (height, width).
+        normal: outward normals of any length, shape (height, width, 3).
+    """
+    lamp = (camera.light_view or camera).distance * np.hypot(1, np.hypot(uniforms.LIGHT_RIGHT, uniforms.LIGHT_UP))
+    below = np.maximum(np.where(np.isfinite(depth), depth, lamp), uniforms.METAL_NEAREST * lamp)
     facing, to_light, to_eye, _ = illuminate(camera, factor, below, normal)
     cosine = np.maximum((facing * to_light).sum(axis=-1), 0)
     mirrored = 2 * (facing * to_eye).sum(axis=-1, keepdims=True) * facing - to_eye
@@ -196,10 +252,18 @@ def metal(camera: View, factor: int, depth: Array, normal: Array) -> Array:
     return np.asarray(np.minimum(share[..., None] * np.array(uniforms.METAL) + gloss[..., None], 255))
 
 
-def meet(rods: Sequence[Solid], camera: View, size: tuple[int, int], factor: int) -> tuple[Array, Array]:
-    """Find the instruments that samples show, by search: the distance to a rod is convex along a line of sight.
+def intersect(rods: Sequence[Solid], camera: View, size: tuple[int, int], factor: int) -> tuple[Array, Array]:
+    """Intersect the lines of sight with instruments, by search: the distance to a capsule is convex along a line.
 
-    Gives depths [m], infinite where there is none, and normals of any length.
+    Args:
+        rods: instruments, capsules.
+        camera: view to draw from.
+        size: width and height of the picture [px].
+        factor: samples per pixel and axis.
+
+    Returns:
+        Depths [m], infinite where there is no instrument, shape (height, width) in samples; and outward normals of any
+        length, shape (height, width, 3).
     """
     width, height = size[0] * factor, size[1] * factor
     y, x = (np.mgrid[:height, :width] + 0.5) / factor
@@ -224,14 +288,14 @@ def meet(rods: Sequence[Solid], camera: View, size: tuple[int, int], factor: int
         reach = rod.radius * 1.01
         low, high = np.full_like(x, ends.min() - reach), np.full_like(x, ends.max() + reach)
         first = np.copy(low)
-        for _ in range(200):  # ternary search for the place nearest to the rod: the interval shrinks to two thirds
+        for _ in range(200):  # ternary search for the least distance: the interval shrinks to two thirds
             a, b = low + (high - low) / 3, high - (high - low) / 3
             left = np.linalg.norm(outward(a), axis=-1) < np.linalg.norm(outward(b), axis=-1)
             low, high = np.where(left, low, a), np.where(left, b, high)
         middle = (low + high) / 2
         met = np.linalg.norm(outward(middle), axis=-1) <= rod.radius
         low, high = first, middle
-        for _ in range(60):  # bisection for where the line of sight enters the rod
+        for _ in range(60):  # bisection for the entry of the line of sight
             half = (low + high) / 2
             inside = np.linalg.norm(outward(half), axis=-1) <= rod.radius
             low, high = np.where(inside, low, half), np.where(inside, half, high)

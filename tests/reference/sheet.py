@@ -1,4 +1,4 @@
-"""The reference for the sheet: what it is made of, put together cell by cell."""
+"""NumPy reference of the sheet: masses, springs and virtual springs, assembled from the cells."""
 
 from __future__ import annotations
 
@@ -21,13 +21,13 @@ Window = tuple[slice, slice]
 class Springs(NamedTuple):
     """All springs with the same number of points down and to the right between their ends."""
 
-    # here, there: select the points at their ends; `there` is down or to the right of `here`
-    here: Window
-    there: Window
-    offset: Array  # vector from here to there at rest [m], x right, y up, z
+    # windows of the mass points at their ends; `end` is down or to the right of `start`
+    start: Window
+    end: Window
+    offset: Array  # vector from start to end at rest [m], x right, y up, z; shape (3,)
     length: float  # at rest [m]
-    stiffness: Array  # k of each [N/m], shape as selected by `here`
-    unstretched: Array  # length at which each has no force [m]; equal to `length`, unless the sheet is under tension
+    stiffness: Array  # k of each [N/m], shape of the window `start`
+    unstretched: Array  # length without force [m], same shape; `length`, unless the sheet is under tension
 
 
 class Sheet(NamedTuple):
@@ -35,46 +35,53 @@ class Sheet(NamedTuple):
 
     springs: tuple[Springs, ...]  # along rows, along columns and along both diagonals, each spring once
     mass: Array  # of every point [kg], shape (rows, cols)
-    drag: Array  # C of every point [N s/m]
-    virtual: Array  # K of every point [N/m]
+    drag: Array  # C of every point [N s/m], shape (rows, cols)
+    virtual: Array  # K of every point [N/m], shape (rows, cols)
     bending: Any  # D dx dy [N m3]
 
 
-# Points from one end of a spring to the other, down and right.
+# Rows and columns from the start of a spring to its end.
 ALONG_ROW, ALONG_COLUMN, TO_RIGHT, TO_LEFT = (0, 1), (1, 0), (1, 1), (1, -1)
 
 
-def factors(scene: Scene) -> Array:
-    """Give the factor of the stiffness at the centre of every cell, shape (rows - 1, cols - 1); ones without a map."""
+def _factors(scene: Scene) -> Array:
+    """Return the stiffness factor at the centre of every cell, shape (rows - 1, cols - 1); ones without a map."""
     rows, cols = scene.sheet.points
     if scene.stiffness_map is None:
         return np.ones((rows - 1, cols - 1))
     return cell_factors(scene.stiffness_map, _image(scene.stiffness_map), scene.sheet)
 
 
-def foundation_factors(scene: Scene) -> Array:
-    """Give the factor of the foundation at every point, shape (rows, cols); ones without a map."""
-    of = scene.maps.get("foundation_map")
-    return np.ones(scene.sheet.points) if of is None else point_factors(of, _image(of), scene.sheet)
+def _foundation_factors(scene: Scene) -> Array:
+    """Return the factor of the foundation at every point, shape (rows, cols); ones without a map."""
+    stiffness_map = scene.maps.get("foundation_map")
+    if stiffness_map is None:
+        return np.ones(scene.sheet.points)
+    return point_factors(stiffness_map, _image(stiffness_map), scene.sheet)
 
 
-def _image(of: StiffnessMap) -> MapImage:
+def _image(stiffness_map: StiffnessMap) -> MapImage:
     """Read the file of a map, again only when it has changed."""
-    return _read(of, Path(of.image).stat().st_mtime_ns)
+    return _read(stiffness_map, Path(stiffness_map.image).stat().st_mtime_ns)
 
 
 @lru_cache(maxsize=8)
-def _read(of: StiffnessMap, _changed: int) -> MapImage:
-    return read_map(of)
+def _read(stiffness_map: StiffnessMap, _changed: int) -> MapImage:
+    return read_map(stiffness_map)
 
 
 def sheet(scene: Scene) -> Sheet:
-    """Put a scene's sheet together."""
+    """Assemble the sheet of a scene.
+
+    Springs from `springs` have its constants; those of tissue are the ones of a cell dx by dy whose strain energy is
+    that of an isotropic membrane with Poisson's ratio 1/3 (Lloyd et al. 2007), half of each edge's from the cell at
+    either side. Masses and virtual springs of tissue are shares of the cells' area.
+    """
     rows, cols = scene.sheet.points
     if scene.tissue is not None:
         return _of_tissue(scene, scene.tissue)
     assert scene.springs is not None
-    factor = factors(scene)
+    factor = _factors(scene)
     cells = np.ones_like(factor)
     structural, shear = scene.springs.structural, scene.springs.shear
     stiffness = {
@@ -90,7 +97,7 @@ def sheet(scene: Scene) -> Sheet:
 
 def _of_tissue(scene: Scene, tissue: Tissue) -> Sheet:
     dx, dy = spacing(scene.sheet)
-    factor, membrane = factors(scene), tissue.young * tissue.thickness
+    factor, membrane = _factors(scene), tissue.young * tissue.thickness
     cells = np.ones_like(factor)
     along_row = membrane * (9 / 8 * dy / dx - 3 / 8 * dx / dy) / 2
     along_column = membrane * (9 / 8 * dx / dy - 3 / 8 * dy / dx) / 2
@@ -106,7 +113,7 @@ def _of_tissue(scene: Scene, tissue: Tissue) -> Sheet:
     mass = (tissue.density or 0.0) * tissue.thickness * dx * dy / 4 * quarters
     plate = tissue.young * tissue.thickness**3 / 12 / (1 - 1 / 9)
     bending = plate if tissue.bending == "plate" else tissue.bending
-    virtual = tissue.foundation_stiffness * dx * dy / 4 * quarters * foundation_factors(scene)
+    virtual = tissue.foundation_stiffness * dx * dy / 4 * quarters * _foundation_factors(scene)
     return Sheet(springs, mass, tissue.damping * mass, virtual, bending * dx * dy)
 
 
@@ -121,11 +128,11 @@ def _columns_of(cells: Array) -> Array:
 
 
 def _springs(scene: Scene, ahead: tuple[int, int], stiffness: Array, pull: Array) -> Springs:
-    """Make the springs that lead this many points down and right; `pull` is their force at rest over their length."""
+    """Build the springs `ahead` rows and columns long; `pull` is their force at rest over their length [N/m]."""
     (down, right), (dx, dy) = ahead, spacing(scene.sheet)
     rows, cols = scene.sheet.points
-    here = slice(0, rows - down), slice(max(0, -right), cols - max(0, right))
-    there = slice(down, rows), slice(max(0, right), cols - max(0, -right))
+    start = slice(0, rows - down), slice(max(0, -right), cols - max(0, right))
+    end = slice(down, rows), slice(max(0, right), cols - max(0, -right))
     length = math.hypot(right * dx, down * dy)
     shorter = np.divide(pull * length, stiffness, out=np.zeros_like(pull), where=stiffness.real > 0)
-    return Springs(here, there, np.array([right * dx, -down * dy, 0.0]), length, stiffness, length - shorter)
+    return Springs(start, end, np.array([right * dx, -down * dy, 0.0]), length, stiffness, length - shorter)

@@ -68,7 +68,7 @@ def assert_labels_match_twin(made: Scene, position: Array) -> Labels:
     assert ((labels.instrument == 255) == instrument)[equal].all()
     sheet = equal & ~np.isnan(coordinates[..., 0])
     assert sheet.mean() > 0.2
-    pixels, _ = twin.find(made, labels.coordinates[sheet].astype(float), position)
+    pixels, _ = twin.project(made, labels.coordinates[sheet].astype(float), position)
     assert np.abs(pixels - np.argwhere(sheet)[:, ::-1] - 0.5).max() < 0.01
     flow, occlusion = compute_flow(made, labels.coordinates, position, view(made), placed)
     sheet = ~np.isnan(labels.coordinates[..., 0])
@@ -92,7 +92,7 @@ def assert_tracks_match_twin(made: Scene, position: Array) -> NDArray[np.bool_]:
     """Compare pixels and occlusion of 2,000 points with the twin; return the occlusion."""
     coordinates = np.random.default_rng(9).uniform(0, 1, (2000, 2)).astype(np.float32)
     tracks = locate_points(made, coordinates, position, view(made))
-    pixels, hidden = twin.find(made, coordinates.astype(float), position)
+    pixels, hidden = twin.project(made, coordinates.astype(float), position)
     np.testing.assert_array_equal(np.isnan(tracks.pixels), np.isnan(pixels))
     near = np.abs(pixels).max(axis=1) < 1e4
     np.testing.assert_allclose(tracks.pixels[near], pixels[near], atol=1e-4)

@@ -76,7 +76,7 @@ def test_labels_against_the_reference(labelled: Results, small: Path) -> None:
         if frame < 4:
             flow = read_flow(done / f"flow/{frame:04}.flo")
             sheet = ~np.isnan(coordinates[..., 0])
-            pixels, _ = twin.find(scene, coordinates[sheet], position[frame + 1])
+            pixels, _ = twin.project(scene, coordinates[sheet], position[frame + 1])
             assert np.abs(flow[sheet] - (pixels - np.argwhere(sheet)[:, ::-1] - 0.5)).max() < 0.01
             assert (flow[~sheet] == 1e10).all()
             with Image.open(done / f"occlusion/{frame:04}.png") as image:

@@ -165,8 +165,8 @@ def test_pretension_is_isotropic_and_uniform(tmp_path: Path) -> None:
     for springs in assembled(made).springs:
         tension = springs.stiffness * (springs.length - springs.unstretched) / springs.length
         stress += tension.sum() * np.outer(springs.offset, springs.offset)
-        force[springs.here] += tension[..., None] * springs.offset
-        force[springs.there] -= tension[..., None] * springs.offset
+        force[springs.start] += tension[..., None] * springs.offset
+        force[springs.end] -= tension[..., None] * springs.offset
     expected = 12.5 * np.diag([1, 1, 0])
     np.testing.assert_allclose(stress / math.prod(made.sheet.size), expected, rtol=0, atol=1e-13 * 12.5)
     assert np.abs(force[1:-1, 1:-1]).max() < 1e-13 * np.abs(force).max()

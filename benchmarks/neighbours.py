@@ -1,4 +1,4 @@
-"""The springs from a point to its neighbours, for scenes with `springs` and without a map."""
+"""Springs between a mass point and its neighbours, for scenes with `springs` and without a map."""
 
 from __future__ import annotations
 
@@ -23,19 +23,19 @@ class Spring(NamedTuple):
     stiffness: float  # k [N/m]
 
     def ends(self, points: tuple[int, int]) -> tuple[Window, Window]:
-        """Select the points of a sheet (rows, cols) that have this spring, and the neighbours it connects them to."""
+        """Return the windows of the points of a sheet (rows, cols) that have this spring, and of their neighbours."""
         i, i_q = _ends(self.down, points[0])
         j, j_q = _ends(self.right, points[1])
         return (i, j), (i_q, j_q)
 
 
 def _ends(ahead: int, count: int) -> tuple[slice, slice]:
-    """Select, of `count` in a line, those with a neighbour `ahead` places further on, and these neighbours."""
+    """Return the slices of `count` points with a neighbour `ahead` further on, and of these neighbours."""
     return slice(max(0, -ahead), count - max(0, ahead)), slice(max(0, ahead), count - max(0, -ahead))
 
 
 def springs(scene: Scene) -> tuple[Spring, ...]:
-    """List the springs from a point to its neighbours, up to 8, without those of stiffness 0."""
+    """Return the springs from a point to its neighbours, up to 8, without those of stiffness 0."""
     assert scene.springs is not None
     (dx, dy), stencil = spacing(scene.sheet), []
     for down, right in itertools.product((-1, 0, 1), repeat=2):
