@@ -254,7 +254,7 @@ def test_a_frame_that_jumps_is_noted() -> None:
     # 0.0025 a frame.
     assert not notes(4.9 * 0.0025)
     (note,) = notes(5.1 * 0.0025)
-    assert note.startswith("path-dependent at 3 s, frame 3: from the frame before the sheet jumps by 67 %")
+    assert note.startswith("path-dependent at 3 s, frame 3: since the previous frame the sheet jumped by 67 %")
 
 
 def test_a_second_solution_is_the_first_where_only_one_is_possible(device: Device) -> None:
