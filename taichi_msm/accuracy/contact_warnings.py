@@ -16,7 +16,7 @@ from taichi_msm.solver.state import RunProgress
 
 
 def tool_contact_warnings(plan: Plan, progress: RunProgress) -> Iterator[str]:
-    """Warn about tools that slide through a soft sheet, and about the first tool that pierced the sheet.
+    """Warn of tools that slide through a soft sheet, and of the first tool that pierced the sheet.
 
     Args:
         plan: plan of the run.
@@ -67,7 +67,7 @@ def first_piercing_probe(plan: Plan, displacement: NDArray[np.floating], frame: 
 
 def _pierces(tool: Tool, position: NDArray[np.floating], time: float) -> bool:
     """Return whether the axis of a tool intersects a triangle of the sheet."""
-    # The first row of `basis` is the axis, up to its sign; the other two are orthogonal to it.
+    # Rows: the axis, up to its sign, and two directions orthogonal to it.
     basis = np.linalg.svd(tool.axis[None])[2]
     basis[0] = tool.axis
     local = (position - tool.tip_centre(np.array([time]))[0]) @ basis.T

@@ -38,7 +38,7 @@ def diagnose(dynamics: SheetSolver, start: Snapshot | None, pause: Pause) -> Dia
 
     Args:
         dynamics: sheet that diverged; its state afterwards is arbitrary.
-        start: sound state to repeat the run from; None for the state of rest.
+        start: sound state from which the run is repeated; None for the state of rest.
         pause: called several times a second; an exception from it ends the diagnosis.
 
     Returns:
@@ -109,7 +109,7 @@ def _likely_cause(dynamics: SheetSolver, bad_step: int, point: tuple[int, int], 
 
 
 def _is_stable(dynamics: SheetSolver, plan: Plan, frames: int, pause: Pause) -> bool:
-    """Return whether the first frames from rest have no fault."""
+    """Return whether the first frames of a plan, from rest, have no fault."""
     dynamics.restart(plan)
     monitor = DivergenceMonitor(plan)
     for _ in range(frames):

@@ -102,7 +102,8 @@ def coarser_plan(plan: Plan, ratio: float = 0.5) -> Plan | None:
         return None
     cells = [ratio * (count - 1) for count in scene.sheet.points]
     if ratio == SECOND_CELL_RATIO:
-        # Equal parity, so that a tool above the middle touches a mass point in both meshes or in neither.
+        # Numbers of cells with the parity of the plan's, so that both meshes have a mass point in the middle, under a
+        # tool, or neither has.
         cells = [
             count - 1 - 2 * round((count - 1 - few) / 2) for count, few in zip(scene.sheet.points, cells, strict=True)
         ]
@@ -147,7 +148,7 @@ def _sampling_force_error(scene: Scene) -> float:
         (sum_probe_forces(probe, scene.sheet)[0], sum_probe_forces(probe, scene.sheet, refinement)[0])
         for probe in probes
     ]
-    return max((abs(force / exact - 1) for force, exact in pairs if exact > 0), default=0.0)
+    return max((abs(force / fine_force - 1) for force, fine_force in pairs if fine_force > 0), default=0.0)
 
 
 class MeshCompanion:
@@ -175,8 +176,8 @@ class MeshCompanion:
             # Tools must not move too far in a step.
             min_steps = math.ceil(plan.grid.steps_per_frame / 2) if plan.has_contact else 1
             steps = 1 if plan.scene.time.at_rest else max(math.ceil(steps / 2), stable_steps(sheet), min_steps)
-            exact = sheet.with_grid(precision="f64", steps_per_frame=steps)
-            self._sheets.append(build_dynamics(exact, device, cores=cores))
+            in_f64 = sheet.with_grid(precision="f64", steps_per_frame=steps)
+            self._sheets.append(build_dynamics(in_f64, device, cores=cores))
         points = zip(plan.scene.sheet.points, coarse.scene.sheet.points, strict=True)
         self._ratio = min((count - 1) / (fewer - 1) for count, fewer in points)
         self._differences = [0.0 for _ in plans]
@@ -251,11 +252,11 @@ class MeshCompanion:
         order, doubt = None, ""
         if others and first > 0:
             order = math.log(others[0] / first) / math.log(self._ratio) if others[0] > 0 else -math.inf
-        assumed = 1.0
+        assumed_order = 1.0
         if order is not None:
             # An order above 2 counts as 2 minus a quarter of the excess (docs/decisions/0022).
-            assumed = max(1.0, min(order, 2 - (order - 2) / 4))
-        relative = first / (self._ratio**assumed - 1) / self._largest
+            assumed_order = max(1.0, min(order, 2 - (order - 2) / 4))
+        relative = first / (self._ratio**assumed_order - 1) / self._largest
         if order is not None and not 1 <= order <= 3:
             doubt = "runs with fewer points do not converge"
         elif self._may_wrinkle:
@@ -355,18 +356,18 @@ def estimate_mesh_error(plan: Plan, device: Device, progress: ProgressCallback) 
     Returns:
         The estimate after the last frame.
     """
-    exact, coarse, grid = plan.with_grid(precision="f64"), mesh_companion_plan(plan), plan.grid
+    in_f64, coarse, grid = plan.with_grid(precision="f64"), mesh_companion_plan(plan), plan.grid
     assert coarse is not None
-    first = MeshCompanion(exact, coarse, device)
+    first = MeshCompanion(in_f64, coarse, device)
     companion: MeshCompanion | None = first
     while companion is not None:
-        dynamics = build_dynamics(exact, device)
+        dynamics = build_dynamics(in_f64, device)
         for frame in range(grid.frames):
             pause = partial(progress, frame, grid.frames)
             pause()
             dynamics.advance(grid.steps_per_frame, pause)
             companion.compare_frame(dynamics.displacement(), pause)
-        companion = first.build_second_run(exact, device) if companion is first else None
+        companion = first.build_second_run(in_f64, device) if companion is first else None
     return first.estimate
 
 

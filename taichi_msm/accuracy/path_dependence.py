@@ -37,7 +37,11 @@ Array = NDArray[Any]
 
 
 class PathDependence:
-    """Monitor of the path dependence of a quasi-static run."""
+    """Monitor of the path dependence of a quasi-static run.
+
+    Args:
+        plan: plan of the run.
+    """
 
     def __init__(self, plan: Plan) -> None:
         self._plan = plan
@@ -57,7 +61,7 @@ class PathDependence:
         self._differences: list[tuple[float, int, str]] = []
 
     def check_frame(self, frame: int, displacement: Array) -> None:
-        """Compare the next frame with earlier ones.
+        """Check the next frame for a jump, and keep the frames for second solutions.
 
         Args:
             frame: number of the frame.
@@ -162,7 +166,7 @@ def second_solution(plan: Plan, frame: int, device: Device, cores: int | None, p
 
 
 def _load_at_once(plan: Plan, probe: Probe, frame: int) -> Probe:
-    """Return a probe with the load of a frame from 0 s on, or with a straight path to its position at the frame."""
+    """Return a probe with the constant load of a frame, or with a straight path to its position at the frame."""
     rate, sheet = plan.grid.frames_per_second, plan.scene.sheet
     if probe.path is None:
         percent, (x, y) = FrameLoad(probe, sheet).at(frame, rate)

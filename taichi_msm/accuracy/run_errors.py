@@ -75,7 +75,7 @@ class RunErrorEstimator:
     Args:
         plan: plan of the run.
         companions: companion runs of the run.
-        known: estimates from the search for a step or mesh before the run, not repeated here.
+        known: estimates from the searches for a step and a mesh before the run; these errors are not estimated again.
         device: device to run on.
         cores: number of CPU cores for stepping.
 
@@ -134,7 +134,7 @@ class RunErrorEstimator:
             self._max_force = np.maximum(self._max_force, np.linalg.norm(forces, axis=1))
 
     def finish(self, displacements: Iterator[NDArray[Any]] | None, progress: ProgressCallback) -> None:
-        """After the last frame, run further companion runs if the first ones show an error that is not negligible.
+        """Run the subsequent companion runs after the last frame, if the first ones require any.
 
         Args:
             displacements: displacements of the run at all frames but the first [m], each of shape (rows, cols, 3); None
@@ -176,8 +176,8 @@ class RunErrorEstimator:
             known = known._replace(time_step=estimate)
         if self._mesh is not None:
             known = known._replace(mesh=self._mesh.estimate)
-            meets = self._max_force[[not isinstance(tool, Clamp) for tool in self._plan.tools]].all()
-            if self._all_forces and not meets:
+            in_contact = self._max_force[[not isinstance(tool, Clamp) for tool in self._plan.tools]].all()
+            if self._all_forces and not in_contact:
                 known = known._replace(mesh=MeshEstimate(math.inf, NO_CONTACT))
             elif self._plan.has_contact and known.time_step is not None and known.time_step.error > MAX_DIFFERENCE:
                 known = known._replace(mesh=MeshEstimate(math.inf, LARGE_STEP_ERROR))
@@ -233,8 +233,8 @@ def run_warnings(
         )
     if estimate is not None:
         if REMEDY_THRESHOLD < estimate.error < math.inf:
-            of = "the time step" if not estimate.separate or estimate.in_f64 > REMEDY_THRESHOLD / 2 else "rounding"
-            yield f"for a smaller error of {of}, {_step_remedy(plan, estimate, affords)}"
+            source = "the time step" if not estimate.separate or estimate.in_f64 > REMEDY_THRESHOLD / 2 else "rounding"
+            yield f"for a smaller error of {source}, {_step_remedy(plan, estimate, affords)}"
     elif reason == QUASISTATIC_REASON:
         yield "error: no time step in a quasi-static scene"
     elif reason:
@@ -285,7 +285,7 @@ def run_warnings(
 def _error_line(
     estimate: TimeStepEstimate | None, mesh: MeshEstimate | None, max_displacement: float, scale: float | None
 ) -> str:
-    """Format the errors of a run; arguments as for `run_warnings`."""
+    """Format the estimated errors of a run; for the arguments see `run_warnings`."""
     if estimate is not None and estimate.error == math.inf:
         return "error not known: a companion run diverged, or steps do not resolve the damping"
     parts, errors = [], [mesh.error] if mesh is not None and mesh.error < math.inf else []

@@ -127,13 +127,13 @@ class TimeStepCompanion:
     """
 
     def __init__(self, plan: Plan, steps: int, device: Device, cores: int | None = None) -> None:
-        self._order, exact = convergence_order(plan), plan.with_grid(precision="f64")
+        self._order, in_f64 = convergence_order(plan), plan.with_grid(precision="f64")
         coarse = 0 < steps < plan.grid.steps_per_frame
         self._separate = plan.grid.precision == "f64" or not coarse
-        self._dynamics = Dynamics(exact, device, cores=cores)
-        # A run in f64 is itself the second run.
+        self._dynamics = Dynamics(in_f64, device, cores=cores)
+        # A run in f64 serves as the second run; a coarse companion has none.
         needs_same_step = plan.grid.precision != "f64" and not coarse
-        self._same_step = Dynamics(exact, device, cores=cores) if needs_same_step else None
+        self._same_step = Dynamics(in_f64, device, cores=cores) if needs_same_step else None
         self._margin = COARSE_MARGIN * CONTACT_MARGIN if plan.has_contact else 1.0
         self._overlap = overlap(plan.tools, plan.scene.time.duration) is not None
         if coarse:
@@ -149,11 +149,11 @@ class TimeStepCompanion:
             steps: steps per frame of the companion run; 0 if the error cannot be estimated.
         """
         self._plan, self._steps = plan, steps
-        exact = plan.with_grid(precision="f64")
+        in_f64 = plan.with_grid(precision="f64")
         if steps:
-            self._dynamics.restart(exact.with_grid(steps_per_frame=steps))
+            self._dynamics.restart(in_f64.with_grid(steps_per_frame=steps))
             if self._same_step:
-                self._same_step.restart(exact)
+                self._same_step.restart(in_f64)
         self._error = self._rounding = self._in_f64 = self._largest = 0.0
 
     def compile(self) -> None:
@@ -176,13 +176,15 @@ class TimeStepCompanion:
         same_step = self._same_step.displacement() if self._same_step else displacement
         with np.errstate(all="ignore"):
             ratio = self._steps / self._plan.grid.steps_per_frame
-            exact = companion + (companion - same_step) / (ratio**self._order - 1) if self._separate else companion
-            self._error = max(self._error, max_norm(displacement - exact))
+            extrapolated = (
+                companion + (companion - same_step) / (ratio**self._order - 1) if self._separate else companion
+            )
+            self._error = max(self._error, max_norm(displacement - extrapolated))
             # With contact the extrapolated displacement may be far too large.
-            best = exact if not self._plan.has_contact else companion if ratio > 1 else displacement
+            best = extrapolated if not self._plan.has_contact else companion if ratio > 1 else displacement
             self._largest = max(self._largest, max_norm(best))
             if self._same_step:
-                self._in_f64 = max(self._in_f64, max_norm(same_step - exact))
+                self._in_f64 = max(self._in_f64, max_norm(same_step - extrapolated))
                 self._rounding = max(self._rounding, max_norm(displacement - same_step))
 
     def force_error(self, forces: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -45,7 +45,7 @@ from taichi_msm.terms.springs import ALONG_COLUMN, ALONG_ROW, DIAGONAL, SpringTe
 # WITH_LOSS     1 if the last step adds the derivative of the loss, else 0
 COUNT, WORKERS, ROWS, STRIP, U_STEP, MOMENT_ROW, CARRY, CARRIED_ROWS, MAX_CHECKS, BUFFER, WITH_LOSS = range(11)
 
-# Integers per worker in the array `progress`; the first is the number of its finished steps, the others are padding.
+# Integers per worker in the array `progress`: the number of its finished steps, and padding against false sharing.
 STRIDE = 16
 
 # Parts of the adjoint's arrays, in multiples of the sheet's rows: p in two buffers, q, and the derivative of the loss.

@@ -194,7 +194,11 @@ def _all_key_times(scene: Scene) -> Array:
 
 
 class LoadBounds:
-    """Bounds of the loads over time intervals."""
+    """Bounds of the loads over time intervals.
+
+    Args:
+        plan: supplies the probes, their slots and the step.
+    """
 
     def __init__(self, plan: Plan) -> None:
         scene, self._h = plan.scene, plan.grid.step

@@ -26,7 +26,7 @@ class Shape(ABC):
     """The shape of a tool."""
 
     name: ClassVar[str]  # for messages
-    max_stride: ClassVar[float]  # largest displacement of a tool in a step, in radii
+    max_stride: ClassVar[float]  # largest allowed displacement of a tool in a step, in radii
     is_round: ClassVar[bool] = False  # whether it contains every point within `radius` of the axis
 
     @abstractmethod
