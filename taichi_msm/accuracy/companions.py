@@ -30,7 +30,7 @@ QUASISTATIC_REASON = "quasistatic"
 
 
 class CompanionRuns(NamedTuple):
-    """The companion runs of a run."""
+    """The choice of companion runs for a run, and their cost."""
 
     concurrent_steps: int = 0  # steps per frame of the companion run in parallel to the run; 0 without one
     # Steps per frame of the companion run that follows if the first one shows a large error; 0 without one.

@@ -22,11 +22,11 @@ from taichi_msm.solver.state import RunProgress, Snapshot, largest_displacement
 
 @dataclass(frozen=True)
 class Diagnosis:
-    """Diagnosis of a divergence.
+    """The cause of a divergence, and the last state before it.
 
     Attributes:
         message: time, step, mass point, likely cause and remedy.
-        last_sound_state: last state of the run without a fault; None if it is the start.
+        last_sound_state: last state of the run without a fault; None for the state of rest.
     """
 
     message: str

@@ -172,11 +172,11 @@ class MeshCompanion:
         coarsest = None if plan.has_contact else coarser_plan(coarse)
         plans = [coarse] if coarsest is None else [coarse, coarsest]
         self._sheets = []
-        for sheet in plans:
-            # Tools must not move too far in a step.
+        for companion in plans:
+            # At least half of the run's steps with contact, which limits the displacement of tools in a step.
             min_steps = math.ceil(plan.grid.steps_per_frame / 2) if plan.has_contact else 1
-            steps = 1 if plan.scene.time.at_rest else max(math.ceil(steps / 2), stable_steps(sheet), min_steps)
-            in_f64 = sheet.with_grid(precision="f64", steps_per_frame=steps)
+            steps = 1 if plan.scene.time.at_rest else max(math.ceil(steps / 2), stable_steps(companion), min_steps)
+            in_f64 = companion.with_grid(precision="f64", steps_per_frame=steps)
             self._sheets.append(build_dynamics(in_f64, device, cores=cores))
         points = zip(plan.scene.sheet.points, coarse.scene.sheet.points, strict=True)
         self._ratio = min((count - 1) / (fewer - 1) for count, fewer in points)
@@ -327,8 +327,8 @@ def choose_points(
         estimate = estimate_mesh_error(trial, device, progress)
         if estimate.error <= tolerance:
             return trial, estimate
-        # The error decreases at most with the square of the cell length. The search aims at 0.8 of the tolerance, which
-        # makes its mesh nearly the coarsest.
+        # The error decreases at most with the square of the cell length. A target of 0.8 of the tolerance leads to nearly
+        # the coarsest mesh.
         needed = refinement * math.sqrt(estimate.error / (0.8 * tolerance))
         if estimate.doubt in (NARROW_TIP, NOT_CONVERGED) and needed == math.inf:
             needed = MAX_CELL_REFINEMENT * refinement  # On a finer mesh the error is known.

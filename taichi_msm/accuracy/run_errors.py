@@ -93,7 +93,7 @@ class RunErrorEstimator:
         estimates_step = known.time_step is None and not companions.reason
         self._time_step = TimeStepCompanion(plan, steps, device, cores) if estimates_step else None
         coarse = mesh_companion_plan(plan) if companions.mesh and known.mesh is None else None
-        # The meshes are compared with the coarse time-step companion if there is one, except in contact.
+        # Without contact, coarser meshes are compared with the coarse time-step companion, if any.
         self._mesh_follows_coarse = self._coarse and not plan.has_contact
         reference = plan.with_grid(steps_per_frame=steps) if self._mesh_follows_coarse else plan
         self._mesh = None if coarse is None else MeshCompanion(reference, coarse, device, cores)

@@ -62,8 +62,8 @@ class TimeStepEstimate:
     order: int  # of the method in this scene
     # Whether `rounding` and `in_f64` are known separately; else, after a coarse companion run in f32, both are bounds.
     separate: bool = True
-    # Whether the error may be larger: by a coarse companion run a fine one is needed, in contact the error does not
-    # decrease with the step, or the error is too large to be estimated.
+    # Whether the error may be larger: after a coarse companion run that requires a fine one, in contact if the error
+    # does not decrease with the step, or above the largest error that can be estimated.
     at_least: bool = False
     at_most: bool = False  # whether the error may be much smaller, because of contact
 
@@ -244,7 +244,7 @@ class TimeStepTrials:
         self._dynamics = Dynamics(plan, device)
 
     def estimate(self, steps: int, progress: ProgressCallback = lambda done, total: None) -> TimeStepEstimate:
-        """Run the scene and estimate its error.
+        """Run the scene with a number of steps per frame, and estimate its error.
 
         Args:
             steps: steps per frame.

@@ -55,7 +55,7 @@ def _require_memory(plan: Plan) -> None:
     frames, points = plan.grid.frames + 1, math.prod(plan.scene.sheet.points)
     # Four arrays of all positions: displacements, positions, the derivative of the loss, and a copy.
     needed = 4 * 3 * 8 * frames * points
-    # A sparse solution takes 10,400 bytes per mass point for 81 x 81 mass points, and 13,600 for 161 x 161.
+    # A sparse solution takes 10,400 bytes per mass point with 81 x 81 mass points, and 13,600 with 161 x 161.
     needed += 14_000 * points if plan.scene.time.at_rest else motion_bytes(plan)
     if needed > (free := available_memory()):
         raise SceneError([

@@ -33,7 +33,7 @@ class Schedule(NamedTuple):
     """Loads at consecutive steps or given times."""
 
     slots: tuple[ProbeSlot, ...]  # the second axis of `strength` and `point`
-    strength: Array  # force at the control point before the decay [N], shape (steps, slots, 3)
+    strength: Array  # force without decay [N], shape (steps, slots, 3)
     point: Array  # control point, x and y at rest [m], shape (steps, slots, 2)
     active: Array  # active share of the virtual springs' stiffness, 0 to 1, shape (steps,)
 

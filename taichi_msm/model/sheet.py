@@ -68,7 +68,7 @@ def fixed_points(sheet: Sheet) -> NDArray[np.bool_]:
 
 
 def fixed_sides(sheet: Sheet) -> tuple[Side, ...]:
-    """Return the sides of which every mass point is fixed."""
+    """Return the sides whose mass points are all fixed."""
     if isinstance(sheet.fixed, str):
         return tuple(SIDES) if sheet.fixed == "border" else ()
     return sheet.fixed

@@ -99,7 +99,7 @@ def _interpolate(position: NDArray[np.floating], refine: int, coordinates: Array
 
 
 def _cell_coordinates(coordinates: Array, points: tuple[int, int], refine: int) -> tuple[NDArray[Any], ...]:
-    """Return row i and column j of the cell of each point, its coordinates s and t across and down in it, and a twist.
+    """Return row i and column j of each point's cell, the coordinates s (across) and t (down) in it, and a twist.
 
     The twist replaces the product s t of bilinear interpolation. It is linear in each triangle of a small quad.
     """

@@ -63,7 +63,7 @@ class Tool:
 
     @property
     def rough(self) -> bool:
-        """Whether the mass points that it touches stick to it."""
+        """Whether touching mass points stick to the tool."""
         return self.friction == math.inf
 
     @property
@@ -388,7 +388,7 @@ def _axis_distance(a: Tool, b: Tool, offset: Array) -> Array:
 
 
 def gap_to_sheet(tool: Tool, sheet: Sheet) -> float:
-    """Return the distance of a tool at 0 s from the sheet at rest [m], negative where it is in the sheet.
+    """Return the distance of a tool at 0 s from the sheet at rest [m]; the negative depth inside the sheet.
 
     Args:
         tool: position-controlled tool with a shape.
