@@ -242,7 +242,7 @@ def energy_growth_warnings(plan: Plan, progress: RunProgress) -> Iterator[str]:
     ratio = plan.grid.step / plan.stable_step
     if progress.energy_growth * (1 - ratio) > 1 + ratio:
         yield (
-            f"the energy grew {progress.energy_growth:.3g} times after {_release_time(plan):.6g} s, when no probe was "
-            "active any more: the steps are too long for springs that were pressed together, and the motion from "
-            f"there on is invalid; try time.step: {plan.grid.step / 2:.6g}, press less, or take more damping"
+            f"the energy grew by a factor of {progress.energy_growth:.3g} after {_release_time(plan):.6g} s, without "
+            "an active probe: the steps are too long for compressed springs, and the motion from there on is invalid; "
+            f"try time.step: {plan.grid.step / 2:.6g}, press less, or take more damping"
         )

@@ -327,8 +327,8 @@ def choose_points(
         estimate = estimate_mesh_error(trial, device, progress)
         if estimate.error <= tolerance:
             return trial, estimate
-        # The error decreases at most with the square of the cell length. A target of 0.8 of the tolerance leads to nearly
-        # the coarsest mesh.
+        # The error decreases at most with the square of the cell length. A target of 0.8 of the tolerance leads to a
+        # nearly coarsest mesh.
         needed = refinement * math.sqrt(estimate.error / (0.8 * tolerance))
         if estimate.doubt in (NARROW_TIP, NOT_CONVERGED) and needed == math.inf:
             needed = MAX_CELL_REFINEMENT * refinement  # On a finer mesh the error is known.

@@ -317,7 +317,7 @@ def _out_of_reach(tolerance: float, failures: list[TimeStepEstimate]) -> str:
         )
     if last.rounding > MIN_TOLERANCE_SHARE * tolerance:
         return (
-            f"time.tolerance: {tolerance:g} is out of reach of f32, whose rounding alone makes an error of "
+            f"time.tolerance: {tolerance:g} is out of reach of f32, whose rounding alone causes an error of "
             f"{last.rounding:.2g} here; take time.precision: f64, or a tolerance of {_rounded_up(4 * last.rounding):g}"
         )
     weaker = "move the tools less deep, or take" if last.at_most else "take a weaker load or"

@@ -59,7 +59,7 @@ def _require_memory(plan: Plan) -> None:
     needed += 14_000 * points if plan.scene.time.at_rest else motion_bytes(plan)
     if needed > (free := available_memory()):
         raise SceneError([
-            f"a gradient by {points} points in {frames} frames and {plan.grid.steps} steps takes about "
+            f"a gradient with {points} points, {frames} frames and {plan.grid.steps} steps takes about "
             f"{needed / 2**30:.3g} GiB of memory, and {free / 2**30:.3g} GiB is free; take fewer points, or a shorter "
             "time.duration"
         ])  # fmt: skip

@@ -102,7 +102,7 @@ class MotionAdjoint:
         # The carried forces of two workers never share a page.
         self._carried_rows = 1 - (-PAGE // row_bytes)
         self._worker_rows = (MOMENT_ROWS + self._carried_rows) * layout.workers
-        row_sums = -(-kernels.ROW_SUMS * layout.rows // layout.width)
+        sum_rows = -(-kernels.ROW_SUMS * layout.rows // layout.width)
 
         def scalar(rows: int) -> Any:
             return memory.array("f64", layout.config.lanes, rows * layout.width)
@@ -119,7 +119,7 @@ class MotionAdjoint:
         self._differences = vector(layout.rows)
         # Adjoint state, and accumulated derivatives, see `kernel_motion`.
         self._adjoint = vector(kernels.ADJOINT_PARTS * layout.rows + self._worker_rows)
-        self._derivatives = scalar((kernels.SUM_PARTS + self._decay_parts) * layout.rows + row_sums)
+        self._derivatives = scalar((kernels.SUM_PARTS + self._decay_parts) * layout.rows + sum_rows)
         # Derivative of the loss with respect to the displacements of a frame.
         self._loss = vector(layout.rows)
         self._allocated_for, self._backoff = (layout, plan.grid.steps), Backoff()

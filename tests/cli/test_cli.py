@@ -103,7 +103,7 @@ def test_a_tolerance_out_of_reach_is_refused_and_keeps_earlier_results(
     settings = ["--set", "output=[]", "--set", "time.tolerance=1e-9", "--set", "time.precision=f32"]
     done = program("run", "small.yaml", *settings, "--out", "kept")
     assert done.returncode == 2
-    message(done.stderr, "time.tolerance", "f32", hide=r"(?<=makes ).*?(?=;|$)")
+    message(done.stderr, "time.tolerance", "f32", hide=r"(?<=causes ).*?(?=;|$)")
     assert (small / "kept" / "run.json").read_text() == "earlier"
 
 
