@@ -465,7 +465,7 @@ def build_sweep(code: KernelConfig, *, parallel: bool) -> Callable[..., None]:
 
 
 @cache
-def copy_kernel(code: KernelConfig) -> Callable[..., None]:
+def build_copy(code: KernelConfig) -> Callable[..., None]:
     """Build the kernel that copies a range of entries from three arrays to three others."""
     vectors = code.vectors
 

@@ -217,7 +217,7 @@ class MotionAdjoint:
 
     def _copy_step(self, from_entry: int, to_entry: int, source: list[Any], target: list[Any]) -> None:
         with compilation_options():
-            kernels.copy_kernel(self.layout.config)(self._step_entries, from_entry, to_entry, *source, *target)
+            kernels.build_copy(self.layout.config)(self._step_entries, from_entry, to_entry, *source, *target)
 
     def _store_history(self, first: int, table: Array, pause: Pause) -> None:
         """Repeat a segment from its checkpoint with a table of loads, and store the displacements of all steps."""
