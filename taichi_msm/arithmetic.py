@@ -16,7 +16,7 @@ class Operations(NamedTuple):
     maximum: Callable[..., Any]
     minimum: Callable[..., Any]
     where: Callable[..., Any]
-    wrap: Callable[[Callable[..., Any]], Callable[..., Any]]  # makes a function callable from another formula
+    wrap: Callable[[Callable[..., Any]], Callable[..., Any]]  # makes a formula callable from another one
 
 
 NUMPY = Operations(np.sqrt, np.log, np.maximum, np.minimum, np.where, lambda function: function)

@@ -1,8 +1,8 @@
-"""Choice of the companion runs that estimate the error of a run, made from the scene alone.
+"""Choice of the companion runs that estimate the error of a run, before the run.
 
-A companion run repeats the scene with another time step or another mesh, in parallel to the run. With half the steps
-it costs half a run, with twice the steps it costs two. Hence the first companion run is coarse if twice the step is
-stable, and a fine one follows only if the first shows an error that is not negligible.
+A companion run repeats the scene with another time step or another mesh, in parallel to the run. A coarse one, with
+half the steps, costs half a run; a fine one, with twice the steps, costs two. Hence the first companion run is coarse
+if twice the step is stable, and a fine one follows only after an error that is not negligible.
 """
 
 from __future__ import annotations
@@ -16,13 +16,13 @@ from taichi_msm.solver.planning import affords_companions, stable_steps
 # An error below this share of the largest displacement needs no fine companion run.
 NEGLIGIBLE_ERROR = 1e-3
 
-# Largest number of steps of a fine companion run, as a multiple of the run's. If the damping needs more, the error is
-# unknown.
+# Largest number of steps of a fine companion run, as a multiple of the run's. The error is unknown if the damping
+# requires more.
 MAX_STEP_RATIO = 64
 
-# Cost of the companion runs on coarser meshes, in steps of the full sheet per step of the run that they are compared
-# with. Without contact there are two, with half and a quarter of the cells per side and of the steps; with contact one,
-# with 1 / sqrt(2) of the cells per side and half the steps.
+# Cost of the companion runs on coarser meshes, in steps of the full mesh per step of the compared run. Without contact
+# there are two, with 1/2 and 1/4 of the cells per side and of the steps; with contact there is one, with 1 / sqrt(2) of
+# the cells per side and 1/2 of the steps.
 MESH_COST, CONTACT_MESH_COST = 1 / 4 / 2 + 1 / 16 / 4, 1 / 2 / 2
 
 # Reason for the missing time-step error of a quasi-static scene.
@@ -30,7 +30,7 @@ QUASISTATIC_REASON = "quasistatic"
 
 
 class CompanionRuns(NamedTuple):
-    """The companion runs of a run."""
+    """The choice of companion runs for a run, and their cost."""
 
     concurrent_steps: int = 0  # steps per frame of the companion run in parallel to the run; 0 without one
     # Steps per frame of the companion run that follows if the first one shows a large error; 0 without one.
@@ -50,7 +50,7 @@ def choose_companion_runs(plan: Plan, *, requested: bool = False) -> CompanionRu
 
     Args:
         plan: plan of the run.
-        requested: whether the user requested an error estimate at any cost.
+        requested: whether the user requests an error estimate at any cost.
 
     Returns:
         Companion runs and their cost, or the reason for a missing estimate.
@@ -72,7 +72,7 @@ def choose_companion_runs(plan: Plan, *, requested: bool = False) -> CompanionRu
         )
     if not coarse:
         return CompanionRuns(fine, 0, mesh_cost > 0, cost)
-    # Without stored positions, the run is repeated for the companion run that follows.
+    # Without stored positions, a subsequent companion run requires a repetition of the run.
     repetition = 0.0 if plan.scene.output else 1.0
     follows = requested or affords_companions(plan, cost + fine_cost + repetition)
     return CompanionRuns(coarse, fine if follows else 0, mesh_cost > 0, cost)
@@ -82,17 +82,17 @@ def coarse_steps(plan: Plan) -> int:
     """Return the steps per frame of the coarse companion run, half of the run's; 0 if unstable or too expensive."""
     run_steps = plan.grid.steps_per_frame
     steps = max(math.ceil(run_steps / 2), stable_steps(plan))
-    # With more than 0.6 of the run's steps it saves too little.
+    # A companion run with more than 0.6 of the run's steps saves too little.
     return steps if steps <= 0.6 * run_steps else 0
 
 
 def fine_steps(plan: Plan) -> int:
-    """Return the steps per frame of the fine companion run: twice the run's, or more with strong damping.
+    """Return the steps per frame of the fine companion run: r times the run's, with r = 2, or more in strong damping.
 
-    If g h / r > 1, with g = C / m, central differences reverse velocities at every step, and the difference between
-    runs with steps h and h / r underestimates the error. A coarse companion run overestimates it 2 to 4 times.
+    r >= g h, with g = C / m. With a smaller r, central differences reverse velocities at every step, and the difference
+    between runs with steps h and h / r underestimates the error. A coarse companion run overestimates it 2 to 4 times.
 
-    The number is 0 if the damping needs more than `MAX_STEP_RATIO` times the run's steps.
+    The result is 0 if the damping requires r > `MAX_STEP_RATIO`.
     """
     refinement = max(2, math.ceil(plan.material.drag * plan.grid.step))
     return refinement * plan.grid.steps_per_frame if refinement <= MAX_STEP_RATIO else 0

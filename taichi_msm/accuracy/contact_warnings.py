@@ -16,7 +16,7 @@ from taichi_msm.solver.state import RunProgress
 
 
 def tool_contact_warnings(plan: Plan, progress: RunProgress) -> Iterator[str]:
-    """Warn about tools that slide through a soft sheet, and about the first tool that pierced the sheet.
+    """Warn of tools that slide through a soft sheet, and of the first tool that pierced the sheet.
 
     Args:
         plan: plan of the run.
@@ -32,10 +32,10 @@ def tool_contact_warnings(plan: Plan, progress: RunProgress) -> Iterator[str]:
         depth, limit = _max_depth(tool, plan.scene.time.duration), tool.radius / 5
         if membrane < (support := foundation * tool.radius**2) and depth > limit * (1 + 1e-9):
             yield (
-                f"probes.{tool.probe}: the sheet slides off the tip sideways, and its force is too small: the sheet "
-                f"resists stretching by {membrane:.3g} N/m (young x thickness), less than the foundation under the "
-                f"tip, {support:.3g} N/m (foundation x radius^2), and the tip goes {1000 * depth:.3g} mm deep, more "
-                f"than a fifth of its radius, {1000 * limit:.3g} mm; {remedy}press less deep, or with a wider tip"
+                f"probes.{tool.probe}: the sheet slides off the tip sideways, so the force is too small: young x "
+                f"thickness of the sheet, {membrane:.3g} N/m, is less than foundation x radius^2 under the tip, "
+                f"{support:.3g} N/m, and the depth of the tip, {1000 * depth:.3g} mm, is more than a fifth of its "
+                f"radius, {1000 * limit:.3g} mm; {remedy}press less deep, or with a wider tip"
             )
     for tool in plan.tools:
         if tool.probe == progress.pierced_by - 1:
@@ -49,7 +49,7 @@ def tool_contact_warnings(plan: Plan, progress: RunProgress) -> Iterator[str]:
 
 
 def first_piercing_probe(plan: Plan, displacement: NDArray[np.floating], frame: int) -> int:
-    """Return the first position-controlled tool whose axis passes through the sheet.
+    """Find the first position-controlled tool whose axis passes through the sheet.
 
     Args:
         plan: plan of the run.
@@ -67,11 +67,11 @@ def first_piercing_probe(plan: Plan, displacement: NDArray[np.floating], frame: 
 
 def _pierces(tool: Tool, position: NDArray[np.floating], time: float) -> bool:
     """Return whether the axis of a tool intersects a triangle of the sheet."""
-    # The first row of `basis` is the axis, up to its sign; the other two are orthogonal to it.
+    # Rows: the axis, up to its sign, and two directions orthogonal to it.
     basis = np.linalg.svd(tool.axis[None])[2]
     basis[0] = tool.axis
     local = (position - tool.tip_centre(np.array([time]))[0]) @ basis.T
-    # A cell can contain the axis only if it has corners on both sides of it in both orthogonal directions.
+    # The axis can pass only through cells with corners on both sides of it, in both orthogonal directions.
     candidates = np.ones([count - 1 for count in position.shape[:2]], dtype=bool)
     for coordinate in (local[..., 1], local[..., 2]):
         for side in (coordinate <= 0, coordinate >= 0):
@@ -84,7 +84,7 @@ def _pierces(tool: Tool, position: NDArray[np.floating], time: float) -> bool:
         weights = np.roll(x, -1, 1) * np.roll(y, -2, 1) - np.roll(x, -2, 1) * np.roll(y, -1, 1)
         inside = ((weights >= 0).all(axis=1) | (weights <= 0).all(axis=1)) & (weights.sum(axis=1) != 0)
         height = (weights * triangle[..., 0]).sum(axis=1)[inside] / weights.sum(axis=1)[inside]
-        # The tip of a plate lies on the tissue that it presses, so a tenth of the radius is tolerated.
+        # A tenth of the radius is tolerated, because the tip of a plate lies on the pressed tissue.
         depth, *_ = tool.shape.build_depth(NUMPY)(*np.outer(tool.axis, height), *tool.axis, tool.length, tool.radius)
         if ((height >= 0) & (height <= tool.length) & (depth > 0.1 * tool.radius)).any():
             return True
@@ -98,7 +98,7 @@ def _max_depth(tool: Tool, duration: float) -> float:
 
 
 def _stiffnesses(plan: Plan) -> tuple[float, float]:
-    """Return E t [N/m] and the foundation modulus [N/m^3]; maps count with their mean factors."""
+    """Return young x thickness [N/m] and the foundation modulus [N/m3], times the mean factors of the maps."""
     scene, material = plan.scene, plan.material
     if scene.tissue is not None:
         membrane = scene.tissue.young * scene.tissue.thickness

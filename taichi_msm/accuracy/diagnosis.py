@@ -1,4 +1,4 @@
-"""Diagnosis of a divergence: the run is repeated to locate it, and again with finer steps to find the cause."""
+"""Diagnosis of a divergence: its step by repetition of the run, and its cause by runs with finer steps."""
 
 from __future__ import annotations
 
@@ -22,11 +22,11 @@ from taichi_msm.solver.state import RunProgress, Snapshot, largest_displacement
 
 @dataclass(frozen=True)
 class Diagnosis:
-    """Diagnosis of a divergence.
+    """The cause of a divergence, and the last state before it.
 
     Attributes:
         message: time, step, mass point, likely cause and remedy.
-        last_sound_state: last state of the run without a fault; None if it is the start.
+        last_sound_state: last state of the run without a fault; None for the state of rest.
     """
 
     message: str
@@ -38,7 +38,7 @@ def diagnose(dynamics: SheetSolver, start: Snapshot | None, pause: Pause) -> Dia
 
     Args:
         dynamics: sheet that diverged; its state afterwards is arbitrary.
-        start: sound state to repeat the run from; None for the state of rest.
+        start: sound state from which the run is repeated; None for the state of rest.
         pause: called several times a second; an exception from it ends the diagnosis.
 
     Returns:
@@ -82,11 +82,10 @@ def diagnose(dynamics: SheetSolver, start: Snapshot | None, pause: Pause) -> Dia
 
 
 def _likely_cause(dynamics: SheetSolver, bad_step: int, point: tuple[int, int], pause: Pause) -> str:
-    """Describe the likely cause: the time step if a finer one does not diverge, else a force or a path."""
+    """Describe the likely cause: the time step if the run with a finer one is sound, else a force or a path."""
     plan, grid = dynamics.plan, dynamics.plan.grid
     frames, finest_step = -(-bad_step // grid.steps_per_frame), math.inf
-    # Steps times mass points of all trial runs together, about ten seconds. They are counted rather than timed, so that
-    # the message is the same on every machine.
+    # Steps times mass points of all trial runs, about ten seconds; a count, for the same message on every machine.
     budget = 5e9
     for refinement in (2, 4, 8, 16, 32, 64):
         finer = plan.with_grid(steps_per_frame=refinement * grid.steps_per_frame)
@@ -110,7 +109,7 @@ def _likely_cause(dynamics: SheetSolver, bad_step: int, point: tuple[int, int], 
 
 
 def _is_stable(dynamics: SheetSolver, plan: Plan, frames: int, pause: Pause) -> bool:
-    """Return whether the first frames from rest have no fault."""
+    """Return whether the first frames of a plan, from rest, have no fault."""
     dynamics.restart(plan)
     monitor = DivergenceMonitor(plan)
     for _ in range(frames):

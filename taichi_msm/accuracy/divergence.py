@@ -24,9 +24,7 @@ ENERGY_OSCILLATION = 4.0
 def displacement_bound(
     plan: Plan, time: float, acceleration: float | None = None, tool_energy: float | None = None
 ) -> float:
-    """Return a bound of the displacement of a mass point [m], infinite for some scenes.
-
-    A run that exceeds the bound has diverged.
+    """Return a bound of the displacement of a mass point in a sound run [m], infinite for some scenes.
 
     Args:
         plan: plan of the run.
@@ -39,11 +37,11 @@ def displacement_bound(
     # Deformation moves a mass point by at most ten sizes of the sheet; a tool moves the tissue that it holds along its
     # path.
     bound = 10.0 * max(plan.scene.sheet.size) + sum(tool.path_length + tool.radius for tool in plan.tools)
-    # Here springs connect every mass point to a held one; shear springs alone may skip every other mass point.
+    # Springs along rows and columns connect every mass point to a held one. Shear springs alone may connect only half.
     if plan.is_held and min(plan.material.across, plan.material.down) > 0:
         return bound
     if plan.material.virtual > 0 and not plan.material.always_active:
-        # The virtual springs may accelerate a mass point from far away, and release it when it is fast.
+        # Virtual springs may accelerate a distant mass point, and become inactive when it is fast.
         return math.inf
     if plan.tools:
         # Speed of a mass point whose kinetic energy is its share of the supplied energy.
@@ -61,13 +59,13 @@ class DivergenceMonitor:
 
         E(b)^(1/2) <= E(a)^(1/2) + (2 m)^(-1/2) integral of |F| from a to b
 
-    Position-controlled tools add at most the energy E_T of displacing every mass point by the length of their path plus
-    their radius, at their speed. In a deformed sheet this takes more energy, so E_T^(1/2) is added to the right-hand
-    side. The virtual springs store at most another K / 2 |u|^2, with the largest K; when they become active, this is
-    added for the current displacements. With G, the sum of the shares, stress relaxation returns at most 4 G of the
-    largest E so far, and E exceeds the energy of the sheet by at most 1 / (1 - G).
+    Position-controlled tools add E_T^(1/2) to the right-hand side, where E_T is the energy to displace every mass point
+    at the tool's speed by the length of its path plus its radius. The sum of roots instead of energies allows for a
+    deformed sheet, which requires more energy. The virtual springs add at most K / 2 |u|^2 to E, with the largest K;
+    whenever they become active, this is added for the current displacements. Stress relaxation with G, the sum of the
+    shares, returns at most 4 G of the largest E so far, and E is at most 1 / (1 - G) times the energy of the sheet.
 
-    After the last load, energy that grows is a sign of steps that are too long for compressed springs, see
+    A growth of the energy after the last load shows steps that are too long for compressed springs, see
     `energy_growth_warnings`.
 
     Args:
@@ -87,13 +85,13 @@ class DivergenceMonitor:
         self._relaxing = sum(share for share, _ in material.relaxation)
         self._oscillation /= 1 - self._relaxing
         self._underflow = _underflow_energy(plan)
-        # Stiffness of virtual springs that are active after the last load, too [N/m].
+        # Stiffness of the virtual springs after the last load [N/m]; 0 if they are active only under load.
         lasting = material.always_active and material.virtual > 0
         self._lasting_stiffness = material.virtual * point_shares(plan) if lasting else np.zeros((1, 1))
         self.change_loads(plan)
 
     def change_loads(self, plan: Plan) -> None:
-        """Replace the loads from now on; the same control points must move as before."""
+        """Replace the loads from now on; fixed control points must remain fixed, and moving ones moving."""
         self._plan, self._loads = plan, LoadBounds(plan)
         self._acceleration = max(self._acceleration, max_free_acceleration(plan))
         self._tool_energy = max(self._tool_energy, _tool_energy_bound(plan))
@@ -130,9 +128,9 @@ class DivergenceMonitor:
         return fault
 
     def _energy_growth(self, reading: Reading, frame: int) -> tuple[float, float]:
-        """Return the smallest energy of a frame since the last load [J], 0 before, and the largest growth since."""
+        """Return the smallest energy of a frame after the last load [J], 0 until then, and the largest growth."""
         least, growth = self.progress.least_energy, self.progress.energy_growth
-        # Relaxation returns some of the energy.
+        # Stress relaxation returns energy, so growth is not an error.
         if (
             self._plan.material.relaxation
             or frame / self._grid.frames_per_second < _release_time(self._plan) + self._grid.step
@@ -140,7 +138,7 @@ class DivergenceMonitor:
             return least, growth
         displacement = reading.displacement.astype(np.float64)
         energy = reading.energy + foundation_energy(self._plan.material, self._lasting_stiffness, displacement)
-        # Rounding may add energy; below 1e-3 of the largest energy it does not affect the result.
+        # Energies below 1e-3 of the largest may grow by rounding, without effect on the result.
         if least > 0 and energy > max(least, 1e-3 * self.progress.peak):
             growth = max(growth, energy / least)
         return min(least or energy, energy), growth
@@ -207,7 +205,7 @@ def _tool_energy_bound(plan: Plan) -> float:
 
 
 def _underflow_energy(plan: Plan) -> float:
-    """Return the energy below which its squared terms may underflow [J]."""
+    """Return the energy below which the squares in its sum may underflow [J]."""
     tiny = float(np.finfo(np.float32 if plan.grid.precision == "f32" else np.float64).tiny)
     (dx, dy), material = spacing(plan.scene.sheet), plan.material
     inertia = material.mass / plan.grid.step**2
@@ -226,11 +224,11 @@ def _release_time(plan: Plan) -> float:
 
 
 def energy_growth_warnings(plan: Plan, progress: RunProgress) -> Iterator[str]:
-    """Warn if the energy grew without a load by more than it oscillates with this time step.
+    """Warn of a growth of the energy after the last load beyond its oscillation with this time step.
 
-    The energy is measured with the position x_n and the velocity half a step before. For a mode of frequency w it
-    differs from the energy that Verlet's method conserves by a factor between 1 - w h / 2 and 1 + w h / 2, where
-    w h / 2 is at most r = h / h_stable. Hence an energy more than (1 + r) / (1 - r) times an earlier one has grown.
+    The energy is measured from the position x_n and the velocity half a step before. For a mode of frequency w it is
+    between 1 - w h / 2 and 1 + w h / 2 times the energy that Verlet's method conserves, where w h / 2 is at most
+    r = h / h_stable. Hence a factor above (1 + r) / (1 - r) between two energies is growth.
 
     Args:
         plan: plan of the run.
@@ -244,7 +242,7 @@ def energy_growth_warnings(plan: Plan, progress: RunProgress) -> Iterator[str]:
     ratio = plan.grid.step / plan.stable_step
     if progress.energy_growth * (1 - ratio) > 1 + ratio:
         yield (
-            f"the energy grew {progress.energy_growth:.3g} times after {_release_time(plan):.6g} s, when no probe was "
-            "active any more: the steps are too long for springs that were pressed together, and the motion from "
-            f"there on is invalid; try time.step: {plan.grid.step / 2:.6g}, press less, or take more damping"
+            f"the energy grew by a factor of {progress.energy_growth:.3g} after {_release_time(plan):.6g} s, without "
+            "an active probe: the steps are too long for compressed springs, and the motion from there on is invalid; "
+            f"try time.step: {plan.grid.step / 2:.6g}, press less, or take more damping"
         )

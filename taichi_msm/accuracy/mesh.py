@@ -4,25 +4,24 @@ If u_c is the displacement with cells r times as long, Richardson's extrapolatio
 |u - u_c| / (r^p - 1). The lattice has order p = 2 in the cell length where the displacement is smooth, and a lower one
 at the rim of a tool's flat end, at an edge in a map, at a fixed edge without tension, and in wrinkles. Hence p is
 measured with three runs: the run, and two with half and a quarter of its cells per side. An order above 2 shows that
-the coarsest run is too coarse, and counts as somewhat less than 2. An order below 1 counts as 1, and so does an unknown
-order, if the mass points are too few for a third run.
+the coarsest run is too coarse, and counts as somewhat less than 2. An order below 1 counts as 1, and so does the
+unknown order of a mesh that is too small for a third run.
 
-Each of the three runs takes steps twice as long as the previous one, so that the time-step error decreases together
-with the mesh error. If there is a coarse time-step companion, it replaces the run as the first of the three. The
-estimate includes up to four times the time-step error, which is usually far smaller.
+Each of the three runs has steps twice as long as the previous one, so the time-step error decreases together with the
+mesh error. A coarse time-step companion, if any, replaces the run as the first of the three. The estimate includes up
+to four times the time-step error, which is usually far smaller than the mesh error.
 
-The estimate is doubled and reported as "at least" where the error may be larger: if the three runs do not converge, or
-if tissue without bending is compressed and therefore wrinkles more on finer meshes.
+The estimate is doubled and reported as "at least" if the error may be larger: if the three runs do not converge, or if
+tissue without bending is compressed, which wrinkles more on finer meshes.
 
 The force of a tool that is hardly wider than a cell differs from its total, depending on the positions of the mass
 points. The coarser runs have the same force as the run, and its difference from the total is added to the error.
 
-Position-controlled tools come into contact with one mass point after another, and on a much coarser mesh with few or
-none. Hence there is one companion run with 1 / sqrt(2) of the cells per side and half the steps. It is compared with
-the run itself, because a coarse time-step companion may have other contacts, and the estimate is CONTACT_ERROR_FACTOR
-times the difference. A difference above SECOND_RUN_DIFFERENCE is unreliable, because the tool may have left one of the
-two sheets earlier; then a second companion run follows, with SECOND_CELL_RATIO of the cells per side
-(docs/decisions/0027).
+Position-controlled tools touch one mass point after another, and few or none on a much coarser mesh. Hence there is one
+companion run with 1 / sqrt(2) of the cells per side and half the steps. It is compared with the run itself, because a
+coarse time-step companion may have other contacts, and the estimate is CONTACT_ERROR_FACTOR times the difference. A
+difference above SECOND_RUN_DIFFERENCE is unreliable, because the tool may have left one of the two sheets earlier. A
+second companion run with SECOND_CELL_RATIO of the cells per side then follows (docs/decisions/0027).
 
 With `springs`, a sheet with another mesh is a different sheet, so its error is undefined.
 """
@@ -53,24 +52,17 @@ from taichi_msm.solver.planning import choose_precision, plan_variant, stable_st
 from taichi_msm.solver.rest import build_dynamics
 from taichi_msm.system.runtime import Device
 
-# Order with position-controlled tools.
+# Order p of the mesh error with position-controlled tools.
 CONTACT_ORDER = 1.5
 
-# With position-controlled tools:
-# - cells per side of the companion run, as a share of the run's;
-CONTACT_CELL_RATIO = 1 / math.sqrt(2)
-# - estimated error, as a multiple of the difference from the companion run;
-CONTACT_ERROR_FACTOR = 1.2
-# - difference, as a share of the largest displacement, above which a second companion run follows;
-SECOND_RUN_DIFFERENCE = 0.4
-# - cells per side of the second companion run, as a share of the run's;
-SECOND_CELL_RATIO = 0.85
-# - estimated error, as a multiple of the geometric mean of both differences;
-SECOND_ERROR_FACTOR = 0.7
-# - largest meaningful difference of the last companion run, as a share of the largest displacement;
-MAX_DIFFERENCE = 1.0
-# - smallest radius of a tool for which the comparison is meaningful, in cells of the run.
-MIN_RADIUS_CELLS = 0.8
+# Companion runs with position-controlled tools; differences are shares of the largest displacement.
+CONTACT_CELL_RATIO = 1 / math.sqrt(2)  # cells per side of the first companion run, as a share of the run's
+CONTACT_ERROR_FACTOR = 1.2  # estimated error, as a multiple of the difference
+SECOND_RUN_DIFFERENCE = 0.4  # difference above which a second companion run follows
+SECOND_CELL_RATIO = 0.85  # cells per side of the second companion run, as a share of the run's
+SECOND_ERROR_FACTOR = 0.7  # estimated error, as a multiple of the geometric mean of both differences
+MAX_DIFFERENCE = 1.0  # largest meaningful difference from the last companion run
+MIN_RADIUS_CELLS = 0.8  # smallest meaningful radius of a tool, in cells of the run
 
 # Largest refinement of the cells from one trial run of a search to the next.
 MAX_CELL_REFINEMENT = 2.0
@@ -80,11 +72,11 @@ MIN_POINTS_PER_SIDE = 7
 
 # Reasons for an unknown or underestimated error.
 NO_CONTACT = "a tool on a path meets no point"
-NARROW_TIP = "the radius of a tool on a path is below 0.8 of a cell, so that it touches hardly a point"
+NARROW_TIP = "the radius of a tool on a path is below 0.8 of a cell, so it touches hardly any point"
 LARGE_STEP_ERROR = "the error of the time step is larger than the largest displacement"
-NOT_CONVERGED = "runs whose points are not as close do not approach the run"
-OVERLAP = "the instruments of two tools run through each other, so that the solution is not unique"
-WRINKLING = "tissue without bending is pressed together, and with more points wrinkles more"
+NOT_CONVERGED = "runs with fewer points do not approach this run"
+OVERLAP = "the instruments of two tools run through each other, so the solution is not unique"
+WRINKLING = "tissue without bending wrinkles under compression, and more so with more points"
 
 
 @dataclass(frozen=True)
@@ -104,14 +96,15 @@ def coarser_plan(plan: Plan, ratio: float = 0.5) -> Plan | None:
         ratio: cells per side, as a share of the plan's.
 
     Returns:
-        The plan; None without tissue, with too few mass points, or if the cells would be too long.
+        The plan; None without tissue, with too few mass points, or with cells beyond the largest aspect ratio.
     """
     scene = plan.scene
     if scene.tissue is None or min(scene.sheet.points) < MIN_POINTS_PER_SIDE:
         return None
     cells = [ratio * (count - 1) for count in scene.sheet.points]
     if ratio == SECOND_CELL_RATIO:
-        # Equal parity, so that a tool above the middle touches a mass point in both meshes or in neither.
+        # Numbers of cells with the parity of the plan's, so that both meshes have a mass point in the middle, under a
+        # tool, or neither has.
         cells = [
             count - 1 - 2 * round((count - 1 - few) / 2) for count, few in zip(scene.sheet.points, cells, strict=True)
         ]
@@ -131,12 +124,12 @@ def coarser_plan(plan: Plan, ratio: float = 0.5) -> Plan | None:
 
 
 def mesh_companion_plan(plan: Plan) -> Plan | None:
-    """Plan the first companion run on a coarser mesh; None as from `coarser_plan`."""
+    """Plan the first companion run on a coarser mesh; None where `coarser_plan` returns None."""
     return coarser_plan(plan, CONTACT_CELL_RATIO) if plan.has_contact else coarser_plan(plan)
 
 
 def _with_equal_force(probe: Probe, sheet: Sheet, coarse: Sheet) -> Probe:
-    """Scale the total of a probe, by 1/2 to 2, so that its force on a coarse sheet is the same."""
+    """Scale the total of a probe, by 1/2 to 2, so that its force is the same on both meshes."""
     if probe.total is None:
         return probe
     force, coarse_force = sum_probe_forces(probe, sheet)[0], sum_probe_forces(probe, coarse)[0]
@@ -156,16 +149,17 @@ def _sampling_force_error(scene: Scene) -> float:
         (sum_probe_forces(probe, scene.sheet)[0], sum_probe_forces(probe, scene.sheet, refinement)[0])
         for probe in probes
     ]
-    return max((abs(force / exact - 1) for force, exact in pairs if exact > 0), default=0.0)
+    return max((abs(force / fine_force - 1) for force, fine_force in pairs if fine_force > 0), default=0.0)
 
 
 class MeshCompanion:
     """Companion runs in f64 on coarser meshes, compared with a run frame by frame.
 
-    They are the run of `mesh_companion_plan` and, without position-controlled tools, one with half of its cells.
+    The first is that of `mesh_companion_plan`; without position-controlled tools, a second one has half as many cells
+    per side.
 
     Args:
-        plan: plan of the run that they are compared with.
+        plan: plan of the compared run.
         coarse: plan of the first companion run, from `mesh_companion_plan`.
         device: device to run on.
         cores: number of CPU cores for stepping; None for all.
@@ -179,12 +173,12 @@ class MeshCompanion:
         coarsest = None if plan.has_contact else coarser_plan(coarse)
         plans = [coarse] if coarsest is None else [coarse, coarsest]
         self._sheets = []
-        for sheet in plans:
-            # Tools must not move too far in a step.
+        for companion in plans:
+            # At least half of the run's steps with contact, which limits the displacement of tools in a step.
             min_steps = math.ceil(plan.grid.steps_per_frame / 2) if plan.has_contact else 1
-            steps = 1 if plan.scene.time.at_rest else max(math.ceil(steps / 2), stable_steps(sheet), min_steps)
-            exact = sheet.with_grid(precision="f64", steps_per_frame=steps)
-            self._sheets.append(build_dynamics(exact, device, cores=cores))
+            steps = 1 if plan.scene.time.at_rest else max(math.ceil(steps / 2), stable_steps(companion), min_steps)
+            in_f64 = companion.with_grid(precision="f64", steps_per_frame=steps)
+            self._sheets.append(build_dynamics(in_f64, device, cores=cores))
         points = zip(plan.scene.sheet.points, coarse.scene.sheet.points, strict=True)
         self._ratio = min((count - 1) / (fewer - 1) for count, fewer in points)
         self._differences = [0.0 for _ in plans]
@@ -223,7 +217,7 @@ class MeshCompanion:
             self._shortest_spring = min(self._shortest_spring, reading.shortest_spring)
 
     def tool_forces(self) -> NDArray[np.float64]:
-        """Return `Dynamics.tool_forces` of the first companion run [N], shape (tools, 3)."""
+        """Return the mean tool forces of the first companion run since the previous frame [N], shape (tools, 3)."""
         return self._sheets[0].tool_forces()
 
     def build_second_run(self, plan: Plan, device: Device, cores: int | None = None) -> MeshCompanion | None:
@@ -260,11 +254,11 @@ class MeshCompanion:
         order, doubt = None, ""
         if others and first > 0:
             order = math.log(others[0] / first) / math.log(self._ratio) if others[0] > 0 else -math.inf
-        assumed = 1.0
+        assumed_order = 1.0
         if order is not None:
             # An order above 2 counts as 2 minus a quarter of the excess (docs/decisions/0022).
-            assumed = max(1.0, min(order, 2 - (order - 2) / 4))
-        relative = first / (self._ratio**assumed - 1) / self._largest
+            assumed_order = max(1.0, min(order, 2 - (order - 2) / 4))
+        relative = first / (self._ratio**assumed_order - 1) / self._largest
         if order is not None and not 1 <= order <= 3:
             doubt = "runs with fewer points do not converge"
         elif self._may_wrinkle:
@@ -273,7 +267,7 @@ class MeshCompanion:
 
     @property
     def _may_wrinkle(self) -> bool:
-        # A spring is shorter than without force by more than 1e-4 of its length.
+        # The shortest spring is compressed by more than 1e-4 of its rest length.
         compressed = self._shortest_spring < 1 - self._material.tension - 1e-4
         return self._material.bending == 0 and compressed
 
@@ -320,7 +314,7 @@ def choose_points(
         The plan with that mesh, and its estimated error.
 
     Raises:
-        SceneError: when even the finest possible mesh is too coarse, or cannot be run.
+        SceneError: when no mesh within the limits meets the tolerance, or a mesh of the search is invalid.
     """
     tolerance, given = plan.scene.sheet.tolerance, plan.scene.sheet.points
     assert tolerance is not None
@@ -331,13 +325,13 @@ def choose_points(
         try:
             trial = choose_precision(check(with_points(plan.scene, (rows, cols)), plan.maps), device.arch)
         except SceneError as error:
-            reason = f"with the {rows} x {cols} points that sheet.tolerance: {tolerance:g} asks for"
+            reason = f"with the {rows} x {cols} points that sheet.tolerance: {tolerance:g} requires"
             raise SceneError([f"{line} ({reason})" for line in error.lines]) from None
         estimate = estimate_mesh_error(trial, device, progress)
         if estimate.error <= tolerance:
             return trial, estimate
-        # The error decreases at most with the square of the cell length. The search aims at 0.8 of the tolerance, which
-        # makes its mesh nearly the coarsest.
+        # The error decreases at most with the square of the cell length. A target of 0.8 of the tolerance leads to a
+        # nearly coarsest mesh.
         needed = refinement * math.sqrt(estimate.error / (0.8 * tolerance))
         if estimate.doubt in (NARROW_TIP, NOT_CONVERGED) and needed == math.inf:
             needed = MAX_CELL_REFINEMENT * refinement  # On a finer mesh the error is known.
@@ -358,30 +352,30 @@ def estimate_mesh_error(plan: Plan, device: Device, progress: ProgressCallback) 
     """Estimate the mesh error of a scene by a run and its companion runs, all in f64.
 
     Args:
-        plan: plan of the scene, for which `mesh_companion_plan` exists.
+        plan: plan of a scene with a `mesh_companion_plan`.
         device: device to run on.
         progress: called with the number of finished frames and their total.
 
     Returns:
         The estimate after the last frame.
     """
-    exact, coarse, grid = plan.with_grid(precision="f64"), mesh_companion_plan(plan), plan.grid
+    in_f64, coarse, grid = plan.with_grid(precision="f64"), mesh_companion_plan(plan), plan.grid
     assert coarse is not None
-    first = MeshCompanion(exact, coarse, device)
+    first = MeshCompanion(in_f64, coarse, device)
     companion: MeshCompanion | None = first
     while companion is not None:
-        dynamics = build_dynamics(exact, device)
+        dynamics = build_dynamics(in_f64, device)
         for frame in range(grid.frames):
             pause = partial(progress, frame, grid.frames)
             pause()
             dynamics.advance(grid.steps_per_frame, pause)
             companion.compare_frame(dynamics.displacement(), pause)
-        companion = first.build_second_run(exact, device) if companion is first else None
+        companion = first.build_second_run(in_f64, device) if companion is first else None
     return first.estimate
 
 
 def interpolate(displacement: NDArray[Any], target: NDArray[Any]) -> NDArray[np.float64]:
-    """Interpolate by cubics at the nodes of another lattice.
+    """Interpolate a lattice by cubics at the nodes of another lattice.
 
     Args:
         displacement: displacements at the nodes of a lattice of at least 4 x 4 [m], shape (rows, cols, 3).
@@ -399,7 +393,12 @@ def interpolate(displacement: NDArray[Any], target: NDArray[Any]) -> NDArray[np.
 
 @lru_cache(maxsize=64)
 def _cubic_weights(source: int, target: int) -> tuple[NDArray[np.intp], NDArray[np.float64]]:
-    """Return the first of four source nodes, and their weights, for every target node; arguments: numbers of cells."""
+    """Return the interpolation along a side from `source` to `target` cells.
+
+    Returns:
+        Index of the first of four neighbouring source nodes of every target node, shape (target + 1,), and the weights
+        of the four, shape (4, target + 1).
+    """
     position = np.arange(target + 1) * (source / target)
     first = np.clip(np.floor(position).astype(int) - 1, 0, source - 3)
     t, nodes = position - first, range(4)

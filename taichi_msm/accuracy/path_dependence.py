@@ -1,9 +1,11 @@
 """Path dependence of quasi-static equilibria.
 
-A sheet that buckles or wrinkles has several equilibria under one load. There are two signs of this. Between two frames
-the sheet moves much farther, relative to the change of the loads, than between the frames before and after. The sheet
-reaches another equilibrium if the loads of a frame act at once on the flat sheet and tools move straight to their
-positions; this second solution also differs where frames under equal loads do, in loading and unloading.
+A sheet that buckles or wrinkles has several equilibria under one load. Two checks detect them:
+
+- Jump: relative to the change of the loads, the sheet moves much farther between two frames than between the frames
+  before and after them.
+- Second solution: the sheet reaches another equilibrium if all loads of a frame act at once on the flat sheet, and
+  tools move straight to their positions. This also detects different shapes in loading and unloading.
 """
 
 from __future__ import annotations
@@ -27,15 +29,19 @@ from taichi_msm.solver.rest import build_dynamics
 from taichi_msm.system.runtime import Device
 from taichi_msm.terms import build_terms
 
-# Smallest ratio of the movement in a jump to that between the frames before and after it, for the same change of the
-# loads. A sheet without tension, which moves as the cube root of its load, reaches 4.5 where the load changes its sign.
+# Smallest ratio of the movement in a jump to that between the frames before and after it, each per change of the loads.
+# The ratio of a sheet without tension, which moves as the cube root of its load, is 4.5 at a change of the load's sign.
 JUMP_FACTOR = 6.0
 
 Array = NDArray[Any]
 
 
 class PathDependence:
-    """Monitor of the path dependence of a quasi-static run."""
+    """Monitor of the path dependence of a quasi-static run.
+
+    Args:
+        plan: plan of the run.
+    """
 
     def __init__(self, plan: Plan) -> None:
         self._plan = plan
@@ -44,7 +50,8 @@ class PathDependence:
             for probe in plan.scene.probes
             if not probe.moved
         ]
-        # Previous frame, frame with the largest displacement, and the first frame after it with less than half of that.
+        # Number and displacements of three frames: the previous one, the one with the largest displacement, and the
+        # first one after that with less than half of it.
         self._previous: tuple[int, Array] | None = None
         self._largest, self._most_displaced = 0.0, (0, np.zeros(()))
         self._unloaded: tuple[int, Array] | None = None
@@ -54,7 +61,7 @@ class PathDependence:
         self._differences: list[tuple[float, int, str]] = []
 
     def check_frame(self, frame: int, displacement: Array) -> None:
-        """Compare the next frame with earlier ones.
+        """Check the next frame for a jump, and keep the frames for second solutions.
 
         Args:
             frame: number of the frame.
@@ -70,7 +77,7 @@ class PathDependence:
             if len(self._moves) == 3 and min(change for _, change in self._moves) > 0:
                 before, rate, after = (distance / change for distance, change in self._moves)
                 if rate > JUMP_FACTOR * max(before, after):
-                    description = "from the frame before the sheet jumps by"
+                    description = "since the previous frame the sheet jumped by"
                     self._differences.append((self._moves[1][0], frame - 1, description))
         self._previous = current
 
@@ -89,13 +96,13 @@ class PathDependence:
         return change
 
     def affords(self, companion_cost: float) -> bool:
-        """Return whether second solutions, in addition to companion runs of a cost, are a small part of the run."""
-        # Three second solutions, each from rest, which costs about three frames of the run.
+        """Return whether second solutions and companion runs of a given cost together cost a small part of the run."""
+        # There are three second solutions. Each costs about three frames of the run, because it begins at rest.
         second_cost = 3 * 3 / (self._plan.grid.frames + 1)
         return affords_companions(self._plan, companion_cost + second_cost)
 
     def finish(self, device: Device, cores: int | None, pause: Pause) -> None:
-        """Solve the most displaced frame, one after it and the last frame a second time, see `second_solution`.
+        """Solve the most displaced frame, a later half-unloaded frame and the last frame again by `second_solution`.
 
         Args:
             device: device to solve on.
@@ -112,9 +119,9 @@ class PathDependence:
                 self._differences.append((max_norm(displacement - second), frame, description))
 
     def warnings(self) -> Iterator[str]:
-        """Warn of the frame that differs most from the result of another loading path."""
+        """Warn of the frame with the largest difference between loading paths."""
         distance, frame, description = max(self._differences, default=(0.0, 0, ""))
-        # Shapes that differ by more than 1 % of the largest displacement are different equilibria.
+        # A difference above 1 % of the largest displacement means different equilibria.
         if distance > 0.01 * self._largest:
             remedy = "tissue.pretension, bending or a stiffer foundation"
             if self._plan.scene.tissue is None:
@@ -138,8 +145,8 @@ def second_solution(plan: Plan, frame: int, device: Device, cores: int | None, p
         pause: called often; an exception from it ends the solution.
 
     Returns:
-        Displacements [m], shape (rows, cols, 3); None if a tool holds tissue at this frame, which depends on its path,
-        or if there is no equilibrium.
+        Displacements [m], shape (rows, cols, 3); None without an equilibrium, or in a grip, whose equilibrium always
+        depends on the path.
     """
     scene, rate = plan.scene, plan.grid.frames_per_second
     if any(frame in grip_frames(grip, rate) for tool in plan.tools for grip in tool.grips):
@@ -159,7 +166,7 @@ def second_solution(plan: Plan, frame: int, device: Device, cores: int | None, p
 
 
 def _load_at_once(plan: Plan, probe: Probe, frame: int) -> Probe:
-    """Return a probe with the load of a frame from 0 s on, or with a straight path to its position at the frame."""
+    """Return a probe with the constant load of a frame, or with a straight path to its position at the frame."""
     rate, sheet = plan.grid.frames_per_second, plan.scene.sheet
     if probe.path is None:
         percent, (x, y) = FrameLoad(probe, sheet).at(frame, rate)
@@ -167,6 +174,7 @@ def _load_at_once(plan: Plan, probe: Probe, frame: int) -> Probe:
         return probe.model_copy(update={"load": ((0.0, percent),), "at": at})
     times, *coordinates = np.array(probe.path, dtype=float).T
     position = (float(np.interp(frame / rate, times, each)) for each in coordinates)
-    # After its last keyframe a tool does not count as pressing.
+    # A path that ended before the frame ends at 0.5 s, before the solution at 1 s. Hence a foundation that is active
+    # only under load is active in both or in neither.
     end = 1.0 if frame / rate <= times[-1] else 0.5
     return probe.model_copy(update={"path": ((0.0, *probe.path[0][1:]), (end, *position)), "grip": ()})

@@ -37,20 +37,19 @@ from taichi_msm.solver.planning import plan_variant
 from taichi_msm.solver.state import RunProgress
 from taichi_msm.system.runtime import Device
 
-# Error of a tool's force, as a multiple of the root mean square of its difference from the companion run over the
-# frames with contact (docs/decisions/0027).
+# Error of a tool's force, as a multiple of its root-mean-square difference from the companion run over the frames with
+# contact (docs/decisions/0027).
 FORCE_ERROR_FACTOR = 1.15
 
-# Lower bound of the relative error of a tool's force, as a multiple of the mesh error of the displacement. Without it,
-# a grip with about the same force in both runs by chance would have no error. The upper bound is the error of the
-# displacement (docs/decisions/0027).
+# Lower bound of the relative error of a tool's force, as a multiple of the mesh error of the displacement, for grips
+# with equal forces in both runs by chance. The upper bound is the error of the displacement (docs/decisions/0027).
 MIN_MESH_ERROR_SHARE = 0.5
 
-# Smallest length of a spring, relative to its rest length, for which the stability limit holds (see
-# `SpringTerm.stiffness_bound`).
+# Smallest ratio of a spring's length to its rest length for which the stability limit holds, see
+# `SpringTerm.stiffness_bound`.
 MIN_SPRING_RATIO = 0.5
 
-# A remedy is suggested for an error above this share of the largest displacement.
+# Smallest error for which a remedy is suggested, as a share of the largest displacement.
 REMEDY_THRESHOLD = 0.01
 
 
@@ -76,7 +75,7 @@ class RunErrorEstimator:
     Args:
         plan: plan of the run.
         companions: companion runs of the run.
-        known: estimates from before the run, which are not repeated.
+        known: estimates from the searches for a step and a mesh before the run; these errors are not estimated again.
         device: device to run on.
         cores: number of CPU cores for stepping.
 
@@ -94,7 +93,7 @@ class RunErrorEstimator:
         estimates_step = known.time_step is None and not companions.reason
         self._time_step = TimeStepCompanion(plan, steps, device, cores) if estimates_step else None
         coarse = mesh_companion_plan(plan) if companions.mesh and known.mesh is None else None
-        # The meshes are compared with the coarse time-step companion if there is one, except in contact.
+        # Without contact, coarser meshes are compared with the coarse time-step companion, if any.
         self._mesh_follows_coarse = self._coarse and not plan.has_contact
         reference = plan.with_grid(steps_per_frame=steps) if self._mesh_follows_coarse else plan
         self._mesh = None if coarse is None else MeshCompanion(reference, coarse, device, cores)
@@ -135,7 +134,7 @@ class RunErrorEstimator:
             self._max_force = np.maximum(self._max_force, np.linalg.norm(forces, axis=1))
 
     def finish(self, displacements: Iterator[NDArray[Any]] | None, progress: ProgressCallback) -> None:
-        """After the last frame, run further companion runs if the first ones show an error that is not negligible.
+        """Run the subsequent companion runs after the last frame, if the first ones require any.
 
         Args:
             displacements: displacements of the run at all frames but the first [m], each of shape (rows, cols, 3); None
@@ -171,14 +170,14 @@ class RunErrorEstimator:
         known = self._known
         if known.time_step is None and self._time_step is not None:
             estimate = self._time_step.estimate
-            # For a run in f32 the estimate of a coarse companion run is an upper bound already.
-            if self._coarse and estimate.parted and NEGLIGIBLE_ERROR <= estimate.error < math.inf:
+            # After a coarse companion run the error may be larger; of a run in f32 the estimate is an upper bound.
+            if self._coarse and estimate.separate and NEGLIGIBLE_ERROR <= estimate.error < math.inf:
                 estimate = replace(estimate, at_least=True)
             known = known._replace(time_step=estimate)
         if self._mesh is not None:
             known = known._replace(mesh=self._mesh.estimate)
-            meets = self._max_force[[not isinstance(tool, Clamp) for tool in self._plan.tools]].all()
-            if self._all_forces and not meets:
+            in_contact = self._max_force[[not isinstance(tool, Clamp) for tool in self._plan.tools]].all()
+            if self._all_forces and not in_contact:
                 known = known._replace(mesh=MeshEstimate(math.inf, NO_CONTACT))
             elif self._plan.has_contact and known.time_step is not None and known.time_step.error > MAX_DIFFERENCE:
                 known = known._replace(mesh=MeshEstimate(math.inf, LARGE_STEP_ERROR))
@@ -220,7 +219,7 @@ def run_warnings(
         probes: records of the probes' forces.
         progress: progress of the run.
         errors: estimated errors of the run.
-        affords: function that returns whether a plan can be run within an hour.
+        affords: function from a plan to whether it runs within an hour.
         scale: pixels per metre at the middle of the sheet; None without a picture.
 
     Yields:
@@ -234,8 +233,8 @@ def run_warnings(
         )
     if estimate is not None:
         if REMEDY_THRESHOLD < estimate.error < math.inf:
-            of = "the time step" if not estimate.parted or estimate.in_f64 > REMEDY_THRESHOLD / 2 else "rounding"
-            yield f"for a smaller error of {of}, {_step_remedy(plan, estimate, affords)}"
+            source = "the time step" if not estimate.separate or estimate.in_f64 > REMEDY_THRESHOLD / 2 else "rounding"
+            yield f"for a smaller error of {source}, {_step_remedy(plan, estimate, affords)}"
     elif reason == QUASISTATIC_REASON:
         yield "error: no time step in a quasi-static scene"
     elif reason:
@@ -262,8 +261,8 @@ def run_warnings(
     if isinstance(foundation, Foundation) and not foundation.lock and progress.deepest > foundation.depth / 3:
         yield (
             f"the sheet was pressed {1000 * progress.deepest:.3g} mm into the {1000 * foundation.depth:.3g} mm of "
-            "tissue.foundation.depth: beyond a third tissue gets much stiffer than this foundation, so that the true "
-            "dent of a force is less deep, and the true force of a path larger; press less"
+            "tissue.foundation.depth: beyond a third, tissue is much stiffer than this foundation, so true dents by a "
+            "force are less deep, and true forces along a path larger; press less"
         )
     if progress.longest_spring > 2:
         yield (
@@ -286,15 +285,15 @@ def run_warnings(
 def _error_line(
     estimate: TimeStepEstimate | None, mesh: MeshEstimate | None, max_displacement: float, scale: float | None
 ) -> str:
-    """Format the errors of a run; arguments as for `run_warnings`."""
+    """Format the estimated errors of a run; for the arguments see `run_warnings`."""
     if estimate is not None and estimate.error == math.inf:
         return "error not known: a companion run diverged, or steps do not resolve the damping"
     parts, errors = [], [mesh.error] if mesh is not None and mesh.error < math.inf else []
     if estimate is not None:
-        bound = _bound_words(estimate.at_most or not estimate.parted, estimate.at_least)
-        name = "time step" if estimate.parted else "time step and rounding"
-        parts.append(f"{name} {bound}{_percent(estimate.in_f64 if estimate.parted else estimate.error, 1)} %")
-        if estimate.parted and estimate.rounding:
+        bound = _bound_words(estimate.at_most or not estimate.separate, estimate.at_least)
+        name = "time step" if estimate.separate else "time step and rounding"
+        parts.append(f"{name} {bound}{_percent(estimate.in_f64 if estimate.separate else estimate.error, 1)} %")
+        if estimate.separate and estimate.rounding:
             parts.append(f"rounding {_percent(estimate.rounding, 1)} %")
         errors.append(estimate.error)
     if mesh is not None and mesh.error < math.inf:
@@ -309,7 +308,7 @@ def _error_line(
 
 
 def _bound_words(at_most: bool, at_least: bool) -> str:
-    """Return the words before an error that may be smaller, larger or both."""
+    """Return the qualifier of an error that may be smaller, larger or both."""
     return ("roughly " if at_least else "at most about ") if at_most else "at least " if at_least else ""
 
 
@@ -330,13 +329,13 @@ def _mesh_remedy(plan: Plan, mesh: MeshEstimate, affords: Callable[[Plan], bool]
     allowed = rows * cols <= MAX_POINTS_RATIO * math.prod(scene.sheet.points) and max(rows, cols) < MAX_POINTS
     if allowed and affords(plan_variant(plan, with_points(scene, (rows, cols)))):
         return f"try sheet.points: {[rows, cols]}"
-    return "tissue.bending, tissue.pretension or a wider tip help more than points do"
+    return "set tissue.bending or tissue.pretension, or take a wider tip; more points help less"
 
 
 def _step_remedy(plan: Plan, estimate: TimeStepEstimate, affords: Callable[[Plan], bool]) -> str:
     """Suggest a remedy for the error of the time step and of rounding."""
-    if not estimate.parted:
-        return "pass --estimate-error to learn whether the step or rounding makes it"
+    if not estimate.separate:
+        return "pass --estimate-error, which separates the errors of the step and of rounding"
     remedies = []
     if estimate.rounding > REMEDY_THRESHOLD / 2:
         remedies.append("time.precision: f64")
@@ -344,6 +343,6 @@ def _step_remedy(plan: Plan, estimate: TimeStepEstimate, affords: Callable[[Plan
         steps = plan.grid.steps_per_frame * (estimate.in_f64 / (REMEDY_THRESHOLD / 2)) ** (1 / estimate.order)
         finer = replace(plan.grid, steps_per_frame=math.ceil(steps))
         if not affords(replace(plan, grid=finer)):
-            return "steps as short as that needs take more than an hour: fewer sheet.points make them faster"
+            return "take fewer sheet.points: with these, the required steps take more than an hour"
         remedies.insert(0, f"time.step: {finer.step:.9g}")
     return f"try {', or '.join(remedies)}"

@@ -34,16 +34,16 @@ from taichi_msm.scene.section import MAX_TOLERANCE
 from taichi_msm.solver.dynamics import Dynamics
 from taichi_msm.system.runtime import Device
 
-# The search ends when the error is at least this share of the tolerance; the step is then within about 10 % of the
-# largest possible one.
+# Smallest error at which the search ends, as a share of the tolerance; the step is then about 90 % of the largest
+# possible one, or more.
 MIN_TOLERANCE_SHARE = 0.75
 
-# Safety factor of an error estimated by a coarse companion run, because the kinks of a load have other positions within
-# its steps than within those of the run (docs/decisions/0021).
+# Safety factor of an error estimated by a coarse companion run, because kinks of a load have other positions in its
+# steps (docs/decisions/0021).
 COARSE_MARGIN = 1.25
 
-# With contact, safety factor of an error estimated by a fine companion run at order 1, and the largest relative change
-# of this error that a coarse companion run can cause (docs/decisions/0027).
+# With contact, the error estimated by a fine companion run at order 1 has the safety factor CONTACT_MARGIN. The coarse
+# companion run changes it by at most the share COARSE_INFLUENCE (docs/decisions/0027).
 CONTACT_MARGIN, COARSE_INFLUENCE = 1.5, 1 / 3
 
 # Largest refinement of the step from one trial run of a search to the next.
@@ -55,15 +55,15 @@ class TimeStepEstimate:
     """Estimated error of the time step and of rounding, as fractions of the largest displacement."""
 
     steps_per_frame: int  # steps per frame of the run
-    # Largest error; infinite if it is unknown: a companion run diverged, or the step does not resolve the damping.
+    # Largest error; infinite if unknown, because a companion run diverged or the step does not resolve the damping.
     error: float
     rounding: float  # part of the error that comes from f32, including positions in the trajectory; 0 in f64
     in_f64: float  # error of the same step in f64
     order: int  # of the method in this scene
-    # Whether both parts are known separately. After a coarse companion run of a run in f32, each is at most the error.
-    parted: bool = True
-    # Whether the error may be larger: a coarse companion run shows an error that only a fine one could determine, the
-    # error does not decrease with the step in contact, or the error is too large to be estimated.
+    # Whether `rounding` and `in_f64` are known separately; else, after a coarse companion run in f32, both are bounds.
+    separate: bool = True
+    # Whether the error may be larger: after a coarse companion run that requires a fine one, in contact if the error
+    # does not decrease with the step, or above the largest error that can be estimated.
     at_least: bool = False
     at_most: bool = False  # whether the error may be much smaller, because of contact
 
@@ -74,7 +74,7 @@ def choose_step(
     """Search for the largest stable step whose estimated error is within the scene's tolerance.
 
     Args:
-        plan: plan with a tolerance; its number of steps per frame is the smallest that is tried.
+        plan: plan with a tolerance, and with the smallest number of steps per frame of the search.
         device: device for the trial runs.
         progress: called with the number of finished frames of each trial run and their total.
 
@@ -86,19 +86,19 @@ def choose_step(
     """
     tolerance, steps, trials = plan.scene.time.tolerance, plan.grid.steps_per_frame, TimeStepTrials(plan, device)
     assert tolerance is not None
-    insufficient, best, failures = steps - 1, None, []
+    too_few, best, failures = steps - 1, None, []
     for _ in range(12):
         trial = trials.estimate(steps, progress)
         if trial.error <= tolerance:
             best = trial
         else:
-            insufficient = steps
+            too_few = steps
             failures.append(trial)
             if trial.rounding > MIN_TOLERANCE_SHARE * tolerance or _stagnates(failures):
                 break
-        if best and (best.error >= MIN_TOLERANCE_SHARE * tolerance or best.steps_per_frame - insufficient <= 1):
+        if best and (best.error >= MIN_TOLERANCE_SHARE * tolerance or best.steps_per_frame - too_few <= 1):
             break
-        steps = max(_next_steps(trial, tolerance), insufficient + 1)
+        steps = max(_next_steps(trial, tolerance), too_few + 1)
         if best and steps >= best.steps_per_frame:
             break
     if not best:
@@ -110,15 +110,14 @@ class TimeStepCompanion:
     """Companion run in f64 with another time step, compared with a run frame by frame.
 
     A fine companion of a run in f32 includes a second run in f64 with the run's own steps, which separates the
-    rounding. A coarse companion has none, to be cheap. Its error is the difference of the two runs, which contains the
-    rounding and r^-p - 1 times the error of the step. If this factor is below `COARSE_MARGIN`, the difference is scaled
-    up to it.
+    rounding. A coarse companion is cheap and has none: its estimate is the difference of the two runs, rounding plus
+    r^-p - 1 times the error of the step. A factor r^-p - 1 below `COARSE_MARGIN` is raised to it.
 
     Args:
         plan: plan of the run.
         steps: steps per frame of the companion run; 0 if the error cannot be estimated.
         device: device to run on.
-        cores: number of CPU cores for stepping; None for all. With the run's number of cores its kernels are reused.
+        cores: number of CPU cores for stepping; None for all. The number of the run reuses its kernels.
 
     Attributes:
         displacement: displacements of the companion run at the last frame [m], shape (rows, cols, 3).
@@ -128,18 +127,18 @@ class TimeStepCompanion:
     """
 
     def __init__(self, plan: Plan, steps: int, device: Device, cores: int | None = None) -> None:
-        self._order, exact = convergence_order(plan), plan.with_grid(precision="f64")
+        self._order, in_f64 = convergence_order(plan), plan.with_grid(precision="f64")
         coarse = 0 < steps < plan.grid.steps_per_frame
-        self._parted = plan.grid.precision == "f64" or not coarse
-        self._dynamics = Dynamics(exact, device, cores=cores)
-        # A run in f64 is itself the second run.
+        self._separate = plan.grid.precision == "f64" or not coarse
+        self._dynamics = Dynamics(in_f64, device, cores=cores)
+        # A run in f64 serves as the second run; a coarse companion has none.
         needs_same_step = plan.grid.precision != "f64" and not coarse
-        self._same_step = Dynamics(exact, device, cores=cores) if needs_same_step else None
+        self._same_step = Dynamics(in_f64, device, cores=cores) if needs_same_step else None
         self._margin = COARSE_MARGIN * CONTACT_MARGIN if plan.has_contact else 1.0
         self._overlap = overlap(plan.tools, plan.scene.time.duration) is not None
         if coarse:
             factor = (plan.grid.steps_per_frame / steps) ** self._order - 1
-            self._margin = COARSE_MARGIN if self._parted else max(1.0, COARSE_MARGIN / factor)
+            self._margin = COARSE_MARGIN if self._separate else max(1.0, COARSE_MARGIN / factor)
         self.restart(plan, steps)
 
     def restart(self, plan: Plan, steps: int) -> None:
@@ -150,11 +149,11 @@ class TimeStepCompanion:
             steps: steps per frame of the companion run; 0 if the error cannot be estimated.
         """
         self._plan, self._steps = plan, steps
-        exact = plan.with_grid(precision="f64")
+        in_f64 = plan.with_grid(precision="f64")
         if steps:
-            self._dynamics.restart(exact.with_grid(steps_per_frame=steps))
+            self._dynamics.restart(in_f64.with_grid(steps_per_frame=steps))
             if self._same_step:
-                self._same_step.restart(exact)
+                self._same_step.restart(in_f64)
         self._error = self._rounding = self._in_f64 = self._largest = 0.0
 
     def compile(self) -> None:
@@ -177,17 +176,19 @@ class TimeStepCompanion:
         same_step = self._same_step.displacement() if self._same_step else displacement
         with np.errstate(all="ignore"):
             ratio = self._steps / self._plan.grid.steps_per_frame
-            exact = companion + (companion - same_step) / (ratio**self._order - 1) if self._parted else companion
-            self._error = max(self._error, max_norm(displacement - exact))
+            extrapolated = (
+                companion + (companion - same_step) / (ratio**self._order - 1) if self._separate else companion
+            )
+            self._error = max(self._error, max_norm(displacement - extrapolated))
             # With contact the extrapolated displacement may be far too large.
-            best = exact if not self._plan.has_contact else companion if ratio > 1 else displacement
+            best = extrapolated if not self._plan.has_contact else companion if ratio > 1 else displacement
             self._largest = max(self._largest, max_norm(best))
             if self._same_step:
-                self._in_f64 = max(self._in_f64, max_norm(same_step - exact))
+                self._in_f64 = max(self._in_f64, max_norm(same_step - extrapolated))
                 self._rounding = max(self._rounding, max_norm(displacement - same_step))
 
     def force_error(self, forces: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the error of the mean forces since the previous frame [N], shape (tools, 3), at order 1."""
+        """Return the error, of order 1, of the mean tool forces since the previous frame [N], shape (tools, 3)."""
         ratio = self._steps / self._plan.grid.steps_per_frame
         return np.asarray(self._margin * abs(ratio / (ratio - 1)) * np.abs(forces - self._dynamics.tool_forces()))
 
@@ -199,32 +200,32 @@ class TimeStepCompanion:
         bound = displacement_bound(self._plan, self._plan.scene.time.duration)
 
         def relative(distance: float) -> float:
-            # Without motion there is no error; a non-finite error is unknown.
+            # A sheet at rest has no error; a non-finite error is unknown.
             share = self._margin * distance / self._largest if self._largest > 0 else 0.0
             return share if share < math.inf and self._largest <= bound else math.inf
 
         error, rounding, in_f64 = (relative(each) for each in (self._error, self._rounding, self._in_f64))
         if not self._same_step:
-            rounding, in_f64 = 0.0 if self._parted else error, error
+            rounding, in_f64 = 0.0 if self._separate else error, error
         steps, contact = self._plan.grid.steps_per_frame, self._plan.has_contact
         at_least = contact and (self._overlap or error > MAX_TOLERANCE)
-        return TimeStepEstimate(steps, error, rounding, in_f64, self._order, self._parted, at_least, contact)
+        return TimeStepEstimate(steps, error, rounding, in_f64, self._order, self._separate, at_least, contact)
 
 
 def combine_estimates(coarse: TimeStepEstimate, fine: TimeStepEstimate) -> TimeStepEstimate:
-    """Combine the estimates of both companion runs.
+    """Combine the estimates of a coarse and a fine companion run.
 
     Args:
         coarse: estimate of the coarse companion run.
         fine: estimate of the fine companion run.
 
     Returns:
-        The fine estimate, with contact adjusted by the coarse one.
+        The fine estimate; with contact, scaled toward the coarse one by at most the share `COARSE_INFLUENCE`.
     """
     if not fine.at_most or fine.error in (0, math.inf):
         return fine
     share = min(max(coarse.error / fine.error, 1 - COARSE_INFLUENCE), 1 + COARSE_INFLUENCE)
-    # Without the margins, the fine companion run differs from the run by more than the coarse one.
+    # The difference of the fine companion run, without the margins, is larger than that of the coarse one.
     grows = fine.error > 2 * CONTACT_MARGIN * coarse.error
     return replace(fine, error=share * fine.error, in_f64=share * fine.in_f64, at_least=fine.at_least or grows)
 
@@ -243,7 +244,7 @@ class TimeStepTrials:
         self._dynamics = Dynamics(plan, device)
 
     def estimate(self, steps: int, progress: ProgressCallback = lambda done, total: None) -> TimeStepEstimate:
-        """Run the scene and estimate its error.
+        """Run the scene with a number of steps per frame, and estimate its error.
 
         Args:
             steps: steps per frame.
@@ -264,7 +265,7 @@ class TimeStepTrials:
         return self._companion.estimate
 
     def _as_stored(self, displacement: NDArray[Any]) -> NDArray[Any]:
-        """Round displacements like the positions of a trajectory in f32, which lose digits to the size of the sheet."""
+        """Round displacements like positions of a trajectory in f32, in which the size of the sheet costs digits."""
         if "trajectory" not in self._plan.scene.output or self._plan.grid.precision == "f64":
             return displacement
         rest = rest_positions(self._plan.scene.sheet)
@@ -297,7 +298,7 @@ def _next_steps(trial: TimeStepEstimate, tolerance: float) -> int:
 
 
 def _stagnates(failures: list[TimeStepEstimate]) -> bool:
-    """Return whether smaller steps hardly reduced the error, three times in succession."""
+    """Return whether three refinements in succession have hardly reduced the error."""
     if len(failures) < 4:
         return False
     return all(
@@ -316,7 +317,7 @@ def _out_of_reach(tolerance: float, failures: list[TimeStepEstimate]) -> str:
         )
     if last.rounding > MIN_TOLERANCE_SHARE * tolerance:
         return (
-            f"time.tolerance: {tolerance:g} is out of reach of f32, whose rounding alone makes an error of "
+            f"time.tolerance: {tolerance:g} is out of reach of f32, whose rounding alone causes an error of "
             f"{last.rounding:.2g} here; take time.precision: f64, or a tolerance of {_rounded_up(4 * last.rounding):g}"
         )
     weaker = "move the tools less deep, or take" if last.at_most else "take a weaker load or"

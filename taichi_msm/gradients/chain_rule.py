@@ -3,8 +3,8 @@
 Closed forms lead from the scene to a `Material`, and on to the coefficients of a time step (`derive` of every term,
 `verlet.coefficients`). They are differentiated by complex steps, exactly but for rounding: f(x + i h) is
 f(x) + i h f'(x) with an h so small that its square vanishes. Loads are linear in the percents of the load and in the
-components of the force, and control points are linear in their keyframes. Hence the derivative with respect to one of
-these values follows from the schedule in which it is 1 and all others are 0.
+components of the force, and control points are linear in their keyframes. The derivative with respect to one of these
+values therefore follows from the schedule with 1 for this value and 0 for all others.
 """
 
 from __future__ import annotations
@@ -36,10 +36,10 @@ COMPLEX_STEP = 1e-60
 
 @dataclass
 class SheetGradient:
-    """Derivatives of a loss with respect to the coefficients of a sheet."""
+    """Derivatives of a loss with respect to the coefficients of a sheet, each named after its coefficient."""
 
     springs: tuple[Array, Array, Array]  # k - tau of every spring, with shapes as of `springs.spring_stiffness`
-    tensions: Array  # tau of each family at constant k - tau, shape (3,)
+    tensions: Array  # tau of springs along rows, along columns and along diagonals at constant k - tau, shape (3,)
     foundation: Array  # log K, the foundation stiffness of every mass point, shape (rows, cols)
     bending: float  # logarithm of the bending stiffness
     stiffening: Array  # log(lock) and factor of the springs, shape (2,)
@@ -49,7 +49,7 @@ class SheetGradient:
     first_gain: float = 0.0  # logarithm of the gain of step 0
 
     def work(self, plan: Plan) -> float:
-        """Return the derivative with respect to the logarithm of a common factor of all internal forces."""
+        """Return the derivative with respect to the logarithm of a factor that scales all internal forces."""
         factors, material = plan.material.factors, plan.material
         assert factors is not None
         total = float(self.tensions @ material.tensions) + float(self.foundation.sum()) + self.bending
@@ -117,7 +117,7 @@ def _coefficient_gradient(plan: Plan, gradient: SheetGradient) -> Array:
     material = plan.material
     assert material.factors is not None
     unit = spring_stiffness(replace(material, across=1.0, down=1.0, shear=1.0), material.factors)
-    # tau is the stiffness times the tension, and k - tau decreases with tau.
+    # With respect to tau = k e at constant k; k - tau decreases with tau.
     tensions = gradient.tensions - [float(by_spring.sum()) for by_spring in gradient.springs]
     springs = [
         float((by_spring * share).sum()) + material.tension * tension
@@ -143,7 +143,7 @@ def _from_logarithm(derivative: float, value: float) -> float:
 
 
 def _gradient_by_factors(plan: Plan, gradient: SheetGradient) -> Array:
-    """Return the derivatives with respect to the factors of the cells, the transpose of `spring_stiffness`."""
+    """Return the derivatives with respect to the factors of the cells, by the transpose of `spring_stiffness`."""
     material = plan.material
     along_rows, along_columns = gradient.springs[0].copy(), gradient.springs[1].copy()
     if not material.by_area:
@@ -155,7 +155,7 @@ def _gradient_by_factors(plan: Plan, gradient: SheetGradient) -> Array:
 
 
 def _material_paths(scene: Scene) -> Iterator[tuple[str, ...]]:
-    """List the material keys that have a derivative."""
+    """Yield the material keys that have a derivative."""
     names = ["young", "thickness", "foundation", "pretension", "bending"]
     dynamic: list[tuple[str, ...]] = [("tissue", "density"), ("tissue", "damping")]
     static: list[tuple[str, ...]] = [("tissue", name) for name in names]
@@ -166,7 +166,7 @@ def _material_paths(scene: Scene) -> Iterator[tuple[str, ...]]:
         law = scene.tissue.foundation
         foundation = ["young", "depth", *(("lock", "factor") if law.lock and law.factor > 1 else ())]
         static[2:3] = [("tissue", "foundation", name) for name in foundation]
-    # A factor of 1 is a linear law, which has no derivative by it.
+    # With a factor of 1 the law is linear, and has no derivative with respect to its numbers.
     if scene.tissue is not None and scene.tissue.stiffening is not None and scene.tissue.stiffening.factor > 1:
         static += [("tissue", "stiffening", name) for name in ("lock", "factor")]
     for path in static if scene.time.at_rest else static + dynamic:
@@ -213,10 +213,10 @@ class LoadGradient:
         """Add the derivatives of a block of steps.
 
         Args:
-            schedule_of: function that returns the schedule of these steps for a plan with other loads.
+            schedule_of: function from a plan with other loads to the schedule of these steps.
             by_slot: derivatives with respect to the force (3) and the control point (2) of every slot, shape (steps,
                 slots, 5).
-            times: interval that contains the loads of the block [s]; other keyframes are skipped.
+            times: time interval of the loads of the block [s]; keyframes that do not affect it are skipped.
         """
         height, width = self._plan.scene.sheet.size
         for index, slots in self._slots.items():
@@ -241,7 +241,7 @@ class LoadGradient:
         return derivatives
 
     def _with_probe(self, index: int, changes: dict[str, Any]) -> Plan:
-        """Change a probe, and remove the slots of the others."""
+        """Return a plan with a changed probe, and with the slots of this probe only."""
         scene, slots = self._plan.scene, self._plan.slots
         probes = list(scene.probes)
         probes[index] = probes[index].model_copy(update=changes)
@@ -249,7 +249,7 @@ class LoadGradient:
         return replace(self._plan, scene=changed, slots=tuple(slots[n] for n in self._slots[index]))
 
     def _with_unit_position(self, index: int, key: int) -> Plan:
-        """Set a position of a control point to (1, 1) m and all others to 0; jumps stay in place."""
+        """Return a plan with a control point at (1, 1) m in one keyframe and at 0 in all others, and the same jumps."""
         plan, slots = self._with_probe(index, {}), []
         for slot in plan.slots:
             ends = np.cumsum([len(segment.times) for segment in slot.segments])
@@ -268,7 +268,10 @@ def _force_key(probe: Probe) -> str:
 
 
 def _active_keys(keys: list[float], times: tuple[float, float], *, before: bool = False) -> Iterator[int]:
-    """List the keyframes that affect a piecewise linear function in an interval; it is constant after the last."""
+    """Yield the keyframes that affect a piecewise linear function in a time interval.
+
+    It is constant after the last keyframe, and with `before` also before the first.
+    """
     for n in range(len(keys)):
         begin = keys[max(0, n - 1)] if n or not before else -np.inf
         end = keys[n + 1] if n + 1 < len(keys) else np.inf

@@ -39,7 +39,7 @@ def require_differentiable(plan: Plan) -> None:
         raise SceneError([f"probes.{tool.probe}.path: {reason}"])
     for term in build_terms(plan):
         if not term.has_gradient:
-            reason = "has no gradient, and no map is fitted with it; remove it, or fit numbers"
+            reason = "has no gradient, which the fit of a map needs; remove it, or fit numbers"
             raise SceneError([f"{term.key}: {reason}"])
 
 
@@ -55,18 +55,18 @@ def _require_memory(plan: Plan) -> None:
     frames, points = plan.grid.frames + 1, math.prod(plan.scene.sheet.points)
     # Four arrays of all positions: displacements, positions, the derivative of the loss, and a copy.
     needed = 4 * 3 * 8 * frames * points
-    # A sparse solution takes 10,400 bytes per mass point for 81 x 81 mass points, and 13,600 for 161 x 161.
+    # A sparse solution takes 10,400 bytes per mass point with 81 x 81 mass points, and 13,600 with 161 x 161.
     needed += 14_000 * points if plan.scene.time.at_rest else motion_bytes(plan)
     if needed > (free := available_memory()):
         raise SceneError([
-            f"a gradient by {points} points in {frames} frames and {plan.grid.steps} steps takes about "
+            f"a gradient with {points} points, {frames} frames and {plan.grid.steps} steps takes about "
             f"{needed / 2**30:.3g} GiB of memory, and {free / 2**30:.3g} GiB is free; take fewer points, or a shorter "
             "time.duration"
         ])  # fmt: skip
 
 
 class Adjoint:
-    """Differentiable simulation in f64 on a CPU, compiled once for repeated runs, also with another stiffness map.
+    """Differentiable simulation in f64 on a CPU, compiled once for runs with several stiffness maps.
 
     Args:
         plan: plan of the scene.
@@ -92,9 +92,9 @@ class Adjoint:
         """Run the scene.
 
         Args:
-            factors: stiffness factors of the cells, shape (rows - 1, cols - 1), which replace those of the scene.
-            pause: called several times a second; an exception from it ends the run, which has no derivatives then.
-            scene: the scene with other forces of its tools; None for the scene of the plan.
+            factors: stiffness factors of the cells, shape (rows - 1, cols - 1); None for those of the scene.
+            pause: called several times a second; an exception from it ends the run, without derivatives.
+            scene: scene with other forces of probes in place of the plan's; None for that of the plan.
 
         Returns:
             Positions at every frame [m], shape (F + 1, rows, cols, 3).
@@ -153,7 +153,7 @@ class Adjoint:
         return replace(plan, material=material, stable_step=limit)
 
 
-# Function of the positions at every frame that returns the value of a loss and its derivative with respect to them.
+# Function from the positions at every frame to the value of a loss and its derivative with respect to the positions.
 Loss = Callable[[Array], tuple[float, Array]]
 
 
@@ -171,7 +171,7 @@ def gradient(scene: Scene | Mapping[str, Any], loss: Loss, threads: int | None =
     radii. A scene with tolerances is resolved first.
 
     Args:
-        scene: scene from `load_scene`, or the same as a mapping.
+        scene: scene from `load_scene`, or a mapping of its keys.
         loss: function of the positions at every frame [m], shape (F + 1, rows, cols, 3). It returns its value and its
             derivative with respect to the positions, an array of the same shape.
         threads: number of CPU threads; None for every core.
@@ -181,7 +181,7 @@ def gradient(scene: Scene | Mapping[str, Any], loss: Loss, threads: int | None =
 
     Raises:
         SceneError: when the scene cannot be run, or a tool has a path.
-        ArgumentError: when the loss returns anything else.
+        ArgumentError: when the result of the loss is not such a pair.
         DivergedError: when the simulation diverges.
         MsmError: when the stiffness of a quasi-static sheet is singular.
 

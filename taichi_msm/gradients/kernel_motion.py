@@ -1,19 +1,18 @@
 """Kernels of the adjoint of the time stepping: one steps forward and stores all displacements, one sweeps backward.
 
-A step is d' = keep d + G F(u), u' = u + d', where G is the gain over the area share of a mass point, 0 where it is
-fixed. Let e be the derivative of the loss with respect to d'. Then p = G e follows, from the last step to the first,
+A step is d' = keep d + G F(u), u' = u + d', where G is the gain divided by the area share of a mass point, or 0 if it
+is fixed. Let e be the derivative of the loss with respect to d'. From the last step to the first, p = G e follows
 
     p_n = p_{n+1} + q_n,    q_n = keep q_{n+1} + G (F'(u_n) p_{n+1} + l_n)
 
 where F' is the Jacobian of the forces, which is symmetric, and l_n the partial derivative of the loss with respect to
-u_n. These are the steps of a sheet with linearised springs, so the adjoint is swept like the sheet. If a coefficient
-changes the force of step n, the loss changes by the product of p_{n+1} with the change of the force; these products
-are accumulated during the sweep.
+u_n. These are the steps of a sheet with linearised springs, so the adjoint is swept like the sheet. A change f of the
+force of step n changes the loss by p_{n+1} . f; the sweep accumulates this product for every coefficient.
 
 Every worker has a band of rows, and steps it from one buffer into another as soon as its neighbours have reached the
-same step. A row is swept from left to right, cell by cell. Each spring is evaluated once, except that both workers
-evaluate those between their bands; sums are stored row by row. Hence the bits do not depend on the number of workers. A
-worker that waits too long gives up, and a single worker finishes for all (`bands`).
+same step. A row is swept from left to right, cell by cell. Each spring is evaluated once, or twice between two bands,
+by both workers. Sums are stored by row, so the bits do not depend on the number of workers. A worker that waits too
+long gives up, and a single worker finishes for all (`bands`).
 """
 
 # No `from __future__ import annotations` here: Taichi reads the annotations of a kernel.
@@ -32,30 +31,42 @@ from taichi_msm.terms.foundation import FoundationTerm
 from taichi_msm.terms.loads import ProbeTerm
 from taichi_msm.terms.springs import ALONG_COLUMN, ALONG_ROW, DIAGONAL, SpringTerm
 
-# Indices into the sizes of a launch: number of steps; number of workers; rows of the sheet; columns of a strip; index
-# of the first step's displacements, or in the sweep of the last step's; row of the arrays where the moments begin, and
-# where the forces carried to the next row begin; rows of carried forces per worker; number of times that a worker
-# checks its neighbour before it gives up; buffer that contains p, 0 or 1; whether the last step adds the derivative of
-# the loss.
-COUNT, WORKERS, ROWS, STRIP, SHAPE, MOMENT_ROW, CARRY, CARRIED_ROWS, MAX_CHECKS, BUFFER, WITH_LOSS = range(11)
+# Indices into the sizes of a launch:
+# COUNT         steps
+# WORKERS       workers
+# ROWS          rows of the sheet
+# STRIP         columns of a strip
+# U_STEP        index of the displacements at the first step; in a sweep at the last step
+# MOMENT_ROW    first row of the moments in the arrays
+# CARRY         first row of the carried forces, which a row adds to the next row
+# CARRIED_ROWS  rows of carried forces per worker
+# MAX_CHECKS    times that a worker checks its neighbour before it gives up
+# BUFFER        buffer that contains p, 0 or 1
+# WITH_LOSS     1 if the last step adds the derivative of the loss, else 0
+COUNT, WORKERS, ROWS, STRIP, U_STEP, MOMENT_ROW, CARRY, CARRIED_ROWS, MAX_CHECKS, BUFFER, WITH_LOSS = range(11)
 
-# Integers per worker in the array `progress`; the first is the number of its finished steps, the others are padding.
+# Integers per worker in the array `progress`: the number of its finished steps, and padding against false sharing.
 STRIDE = 16
 
 # Parts of the adjoint's arrays, in multiples of the sheet's rows: p in two buffers, q, and the derivative of the loss.
 BUFFERS, ADJOINT_CHANGE, LOSS, ADJOINT_PARTS = 0, 2, 3, 4
 
-# Parts of the accumulated derivatives, in multiples of the sheet's rows: with respect to k - tau of springs along rows,
-# along columns and of diagonals; and to log K, for an area share of 1. The derivatives of the decays of standing slots
-# follow.
+# Parts of the accumulated derivatives, in multiples of the sheet's rows, with respect to
+# SPRING_PARTS     k - tau of springs along rows, along columns and along diagonals, 3 parts
+# FOUNDATION_PART  log K, for an area share of 1
+# SUM_PARTS        number of these parts; `decay_gradients` of slots that do not move follow
 SPRING_PARTS, FOUNDATION_PART, SUM_PARTS = 0, 3, 4
 
-# Indices of the sums of a row, which follow the parts: the sum of q u, for the derivative with respect to keep; the
-# derivatives with respect to tau of each family; that with respect to log D; those with respect to log(lock) and the
-# factor of springs, and of the foundation.
+# Indices of the sums of a row, which follow the parts:
+# KEEP_SUM              q . u, for the derivative with respect to keep
+# TENSION_SUMS          derivatives with respect to tau of each family of springs, 3 sums
+# BENDING_SUM           derivative with respect to log D
+# LOCK_SUMS             derivatives with respect to log(lock) and factor of the springs
+# FOUNDATION_LOCK_SUMS  the same of the foundation
+# ROW_SUMS              number of sums
 KEEP_SUM, TENSION_SUMS, BENDING_SUM, LOCK_SUMS, FOUNDATION_LOCK_SUMS, ROW_SUMS = 0, 1, 4, 5, 7, 9
 
-# Number of derivatives of a slot in every step and row: 3 with respect to its force, 2 to its control point.
+# Derivatives per slot, step and row: with respect to the force, 3, and the control point, 2.
 LOAD_DERIVATIVES = 5
 
 
@@ -70,8 +81,8 @@ class AdjointSheet(NamedTuple):
     constants: Any
     rows: Any
     width: Any
-    shapes: Any  # displacements at the steps of a segment, three arrays
-    derivatives: Any  # accumulated derivatives
+    history: Any  # displacements u at all steps of a segment, three arrays
+    derivatives: Any  # accumulated derivatives, see `SPRING_PARTS`
 
 
 class AdjointBand(NamedTuple):
@@ -79,12 +90,12 @@ class AdjointBand(NamedTuple):
 
     low: Any  # first row
     high: Any  # row after the last
-    # source, target: rows where the buffers begin that are read and written
+    # source, target: first rows of the buffer to read and of the buffer to write
     source: Any
     target: Any
-    shape: Any  # row where the displacements begin
-    carry: Any  # row of the forces that are carried to the next row
-    moments: Any  # row where the moments begin
+    u_row: Any  # first row of the displacements of this step
+    carry: Any  # row of the forces carried to the next row
+    moments: Any  # first row of the moments
     n: Any  # index of the step in the table of loads
     with_loss: Any  # whether the derivative of the loss is added
 
@@ -97,11 +108,11 @@ class LoadTables(NamedTuple):
 
 
 def _build_run_worker(step_band: Callable[..., None], *, parallel: bool) -> Callable[..., None]:
-    """Build the function that runs the steps of a launch: of one worker if parallel, otherwise of all workers."""
+    """Build the function that runs the steps of a launch, of one worker if parallel, else of all workers in turn."""
 
     @ti.func
     def wait_for(progress: ti.template(), sizes: ti.template(), worker, k):
-        """Wait for a worker, if it exists, to finish k steps; return whether it did so in time."""
+        """Wait until a worker has finished k steps; return whether it did in time, true for a missing worker."""
         finished = True
         if 0 <= worker < sizes[WORKERS]:
             steps, checks = ti.atomic_add(progress[STRIDE * worker], 0), 0
@@ -132,9 +143,9 @@ def _build_run_worker(step_band: Callable[..., None], *, parallel: bool) -> Call
 
 
 def _build_store_moments(code: KernelConfig) -> list[Callable[..., None]]:
-    """Build the function that stores the moments that row i of a band needs; none without bending.
+    """Return the function that stores the moments for row i of a band, in a list; empty without bending.
 
-    At the first row these are the moments of three rows, and then of one more row each.
+    The first row of a band needs the moments of three rows, every further row those of one more.
     """
     bending, join_strips = code.get(BendingTerm), build_join_strips(code)
     if bending is None:
@@ -180,10 +191,10 @@ def build_store(code: KernelConfig, *, parallel: bool) -> Callable[..., None]:
     def step_band(sheet: ti.template(), loads: ti.template(), sizes: ti.template(), worker, k):
         workers = ti.cast(sizes[WORKERS], ti.i32)
         low, high = sheet.rows * worker // workers, sheet.rows * (worker + 1) // workers
-        shape = (ti.cast(sizes[SHAPE], ti.i32) + k) * sheet.rows
+        u_row = (ti.cast(sizes[U_STEP], ti.i32) + k) * sheet.rows
         carry = ti.cast(sizes[CARRY] + sizes[CARRIED_ROWS] * worker, ti.i32)
         moments = ti.cast(sizes[MOMENT_ROW], ti.i32) + MOMENT_ROWS * worker
-        band = ti.static(AdjointBand(low, high, shape, shape, shape, carry, moments, k, 0))
+        band = ti.static(AdjointBand(low, high, u_row, u_row, u_row, carry, moments, k, 0))
         if low == 0:
             for b in range(1, sheet.width - 1):
                 for c in ti.static(range(3)):
@@ -194,13 +205,13 @@ def build_store(code: KernelConfig, *, parallel: bool) -> Callable[..., None]:
                     store_moments(sheet, band, i)
             kind = ti.select(i == sheet.rows - 1, 2, ti.select(i == 0, 0, 1))
             exists = ti.cast(i + 1 < sheet.rows, real)
-            below = shape + ti.min(i + 1, sheet.rows - 1)
+            below = u_row + ti.min(i + 1, sheet.rows - 1)
             above, at = moments + (i + 2) % MOMENT_ROWS, moments + i % MOMENT_ROWS
             line = ti.static(KernelRow(i, kind, above, at, moments + (i + 1) % MOMENT_ROWS))
             up = 0 - sheet.constants[DY]
-            pass_row(sheet, sheet.u, carry, line, shape + i, below, exists, up, loads, k, i >= low)
+            pass_row(sheet, sheet.u, carry, line, u_row + i, below, exists, up, loads, k, i >= low)
             if i >= low:
-                join_strips(sheet.u, shape + sheet.rows + i, sheet.width)
+                join_strips(sheet.u, u_row + sheet.rows + i, sheet.width)
 
     run_worker = _build_run_worker(step_band, parallel=parallel)
 
@@ -235,12 +246,13 @@ def build_store(code: KernelConfig, *, parallel: bool) -> Callable[..., None]:
 
 
 def _build_sweep_row(code: KernelConfig) -> Callable[..., None]:
+    """Build the function that sweeps a row of a band."""
     vector, columns, springs = code.vector, code.first_column(None), code.require(SpringTerm)
     structural, shear, tension = springs.structural, springs.shear, springs.tense
     differentiate = springs.build_spring_tangent(code)
     *_, row_stiffness, column_stiffness, diagonal_stiffness = springs.build_spring_forces(code)
     tangents = [add for term in code.terms for add in term.build_tangents(code)]
-    reducing = [reduce for term in code.terms for reduce in term.build_damping(code)]
+    dampings = [damp for term in code.terms for damp in term.build_damping(code)]
     probes, foundation_term = code.require(ProbeTerm), code.get(FoundationTerm)
     laplacians = [] if code.get(BendingTerm) is None else [build_laplacian(code)]
     add_load_derivatives = probes.build_load_adjoint(code, SUM_PARTS)
@@ -253,9 +265,9 @@ def _build_sweep_row(code: KernelConfig) -> Callable[..., None]:
 
     @ti.func
     def spring_tangent(sheet: ti.template(), offset, p, q, x0, y0, length, k, family: ti.template()):
-        """Differentiate the spring force between entries p and q; their displacements are `offset` entries later."""
+        """Differentiate the spring force between entries p and q of the adjoint; u is `offset` entries after p."""
         p_difference = [sheet.u[c][p] - sheet.u[c][q] for c in ti.static(range(3))]
-        u_difference = [sheet.shapes[c][p + offset] - sheet.shapes[c][q + offset] for c in ti.static(range(3))]
+        u_difference = [sheet.history[c][p + offset] - sheet.history[c][q + offset] for c in ti.static(range(3))]
         return differentiate(sheet, family, u_difference, p_difference, x0, y0, length, k)
 
     @ti.func
@@ -265,11 +277,11 @@ def _build_sweep_row(code: KernelConfig) -> Callable[..., None]:
 
     @ti.func
     def sweep_row(sheet: ti.template(), band: ti.template(), i, loads: ti.template(), by_load: ti.template()):
-        """Sweep row i of a band; row low - 1 only computes the forces that it carries to the next row."""
+        """Sweep row i of a band; for row low - 1 compute only the forces carried to the band's first row."""
         width, dx, dy, owned = sheet.width, sheet.constants[DX], sheet.constants[DY], i >= band.low
         diagonal, kind = ti.sqrt(dx * dx + dy * dy), ti.select(i == sheet.rows - 1, 2, ti.select(i == 0, 0, 1))
         entry_row, below = (band.source + i) * width, (band.source + ti.min(i + 1, sheet.rows - 1)) * width
-        offset, carry = (band.shape - band.source) * width, band.carry * width
+        offset, carry = (band.u_row - band.source) * width, band.carry * width
         sums = [vector(0) for _ in ti.static(range(ROW_SUMS))]
         load_sums = [vector(0) for _ in ti.static(range(LOAD_DERIVATIVES * slots))]
         now = [loads[band.n, c] for c in ti.static(range(columns))]
@@ -311,16 +323,16 @@ def _build_sweep_row(code: KernelConfig) -> Callable[..., None]:
                     sheet.u[c][carry + b] = (to_below[c] + rising[c]) + down[c]
                 if owned:
                     p = [sheet.u[c][entry_row + b] for c in ti.static(range(3))]
-                    u = [sheet.shapes[c][entry_row + offset + b] for c in ti.static(range(3))]
+                    u = [sheet.history[c][entry_row + offset + b] for c in ti.static(range(3))]
                     entry = ti.static(Entry(line, b, p, u))
                     for add_change in ti.static(tangents):
                         add_change(force, sheet, entry, now)
                     gain = now[GAIN] * sheet.by_column[(MOBILITY + kind) * width + b]
                     q = [sheet.u[c][(ADJOINT_CHANGE * sheet.rows + i) * width + b] for c in ti.static(range(3))]
-                    # The sum of p_{n+1} (u_n - u_{n-1}) over all n equals that of u_n q_{n+1}, up to their order.
+                    # Summed over all n, p_{n+1} (u_n - u_{n-1}) equals u_n q_{n+1} but for rounding.
                     keep_sum = q[0] * u[0] + q[1] * u[1] + q[2] * u[2]
-                    for reduce in ti.static(reducing):
-                        reduce(q, sheet)
+                    for damp in ti.static(dampings):
+                        damp(q, sheet)
                     if band.with_loss:
                         for c in ti.static(range(3)):
                             force[c] += sheet.u[c][(LOSS * sheet.rows + i) * width + b]
@@ -358,10 +370,10 @@ def _build_sweep_row(code: KernelConfig) -> Callable[..., None]:
                     for laplacian in ti.static(laplacians):
                         if kind == 1:
                             # The moments of p are D times its Laplacian, and 0 at the border.
-                            shape = band.shape + i
+                            u_row = band.u_row + i
                             for c in ti.static(range(3)):
                                 curvature = laplacian(
-                                    sheet.shapes[c], width, shape - 1, shape, shape + 1, b,
+                                    sheet.history[c], width, u_row - 1, u_row, u_row + 1, b,
                                     1 / (dx * dx), 1 / (dy * dy),
                                 )  # fmt: skip
                                 sums[BENDING_SUM] = sums[BENDING_SUM] - curvature * sheet.u[c][at * width + b]
@@ -398,13 +410,13 @@ def build_sweep(code: KernelConfig, *, parallel: bool) -> Callable[..., None]:
         workers = ti.cast(sizes[WORKERS], ti.i32)
         low, high = sheet.rows * worker // workers, sheet.rows * (worker + 1) // workers
         n = ti.cast(sizes[COUNT], ti.i32) - 1 - k
-        shape = (ti.cast(sizes[SHAPE], ti.i32) - k) * sheet.rows
+        u_row = (ti.cast(sizes[U_STEP], ti.i32) - k) * sheet.rows
         buffer = (ti.cast(sizes[BUFFER], ti.i32) + k) % 2
         carry = ti.cast(sizes[CARRY] + sizes[CARRIED_ROWS] * worker, ti.i32)
         moments = ti.cast(sizes[MOMENT_ROW], ti.i32) + MOMENT_ROWS * worker
         with_loss = n == 0 and sizes[WITH_LOSS] != 0
         source, target = buffer * sheet.rows, (1 - buffer) * sheet.rows
-        band = ti.static(AdjointBand(low, high, source, target, shape, carry, moments, n, with_loss))
+        band = ti.static(AdjointBand(low, high, source, target, u_row, carry, moments, n, with_loss))
         if low == 0:
             for b in range(1, sheet.width - 1):
                 for c in ti.static(range(3)):
@@ -453,8 +465,8 @@ def build_sweep(code: KernelConfig, *, parallel: bool) -> Callable[..., None]:
 
 
 @cache
-def copy_kernel(code: KernelConfig) -> Callable[..., None]:
-    """Build the kernel that copies entries from three arrays to three others, beginning at given entries."""
+def build_copy(code: KernelConfig) -> Callable[..., None]:
+    """Build the kernel that copies a range of entries from three arrays to three others."""
     vectors = code.vectors
 
     @ti.kernel

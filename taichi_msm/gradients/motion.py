@@ -1,8 +1,8 @@
 """Adjoint of the time stepping, with checkpoints.
 
 The forward run stores a checkpoint at the beginning of every segment; N steps have about sqrt(N / 2) segments, or fewer
-if the sheet is small. Backward in time, each segment is repeated with the displacements of all steps stored, and the
-adjoint is swept over them (`kernel_motion`).
+if the sheet is small. Then, backward in time, each segment runs again and stores the displacements of all its steps,
+and the adjoint is swept over them (`kernel_motion`).
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ from taichi_msm.terms.base import GAIN
 from taichi_msm.terms.foundation import point_shares
 from taichi_msm.terms.loads import ProbeTerm
 
-# Memory that the displacements of a segment may always take [bytes], since each segment costs some launches.
+# Memory of a segment's displacements up to which segments are lengthened, to save launches [bytes].
 SEGMENT_BYTES = 64 * 2**20
 
 # Number of times that a worker checks its neighbour before it gives up; larger than in the forward run, because a
@@ -44,19 +44,19 @@ MAX_WAIT_CHECKS = 8 * MAX_CHECKS
 Array = NDArray[np.float64]
 
 
-def _segment_steps(steps: int, shape_bytes: int) -> int:
-    """Return the number of steps of a segment, whose displacements need about as much memory as all checkpoints.
+def _segment_steps(steps: int, step_bytes: int) -> int:
+    """Return the number of steps of a segment, for displacements that need as much memory as all checkpoints, or more.
 
-    A checkpoint is twice as large as the displacements of a step, `shape_bytes`.
+    A checkpoint is twice as large as the displacements of a step, `step_bytes`.
     """
-    return min(steps, max(math.ceil(math.sqrt(2 * steps)), SEGMENT_BYTES // shape_bytes))
+    return min(steps, max(math.ceil(math.sqrt(2 * steps)), SEGMENT_BYTES // step_bytes))
 
 
 def motion_bytes(plan: Plan) -> int:
     """Return the memory of the adjoint of a dynamic sheet, without the positions at the frames [bytes]."""
-    steps, shape_bytes = plan.grid.steps, 3 * 8 * math.prod(plan.scene.sheet.points)
-    segment = _segment_steps(steps, shape_bytes)
-    return shape_bytes * (segment + 2 * -(-steps // segment) + kernels.ADJOINT_PARTS + kernels.SUM_PARTS)
+    steps, step_bytes = plan.grid.steps, 3 * 8 * math.prod(plan.scene.sheet.points)
+    segment = _segment_steps(steps, step_bytes)
+    return step_bytes * (segment + 2 * -(-steps // segment) + kernels.ADJOINT_PARTS + kernels.SUM_PARTS)
 
 
 class MotionAdjoint:
@@ -91,7 +91,7 @@ class MotionAdjoint:
 
     @property
     def _decay_parts(self) -> int:
-        """Number of parts of the derivatives that contain those of the decays of standing slots."""
+        """Number of parts of `_derivatives` that hold `decay_gradients`, two per slot that does not move."""
         return 2 * self.layout.config.require(ProbeTerm).moves.count(False)
 
     def _allocate(self) -> None:
@@ -102,7 +102,7 @@ class MotionAdjoint:
         # The carried forces of two workers never share a page.
         self._carried_rows = 1 - (-PAGE_BYTES // row_bytes)
         self._worker_rows = (MOMENT_ROWS + self._carried_rows) * layout.workers
-        row_sums = -(-kernels.ROW_SUMS * layout.rows // layout.width)
+        sum_rows = -(-kernels.ROW_SUMS * layout.rows // layout.width)
 
         def scalar(rows: int) -> Any:
             return memory.array("f64", layout.config.lanes, rows * layout.width)
@@ -112,14 +112,14 @@ class MotionAdjoint:
 
         checkpoint_rows = -(-plan.grid.steps // self._segment) * layout.rows
         self._memory = memory
-        # Displacements and differences d at the beginning of every segment; each list has three arrays, for x, y and z.
+        # Displacements u and differences d at the beginning of every segment, each a list of arrays for x, y and z.
         self._checkpoints, self._checkpoint_differences = vector(checkpoint_rows), vector(checkpoint_rows)
         # Displacements at every step of a segment, and differences at its current step.
-        self._shapes = vector(self._segment * layout.rows + self._worker_rows)
+        self._history = vector(self._segment * layout.rows + self._worker_rows)
         self._differences = vector(layout.rows)
         # Adjoint state, and accumulated derivatives, see `kernel_motion`.
         self._adjoint = vector(kernels.ADJOINT_PARTS * layout.rows + self._worker_rows)
-        self._derivatives = scalar((kernels.SUM_PARTS + self._decay_parts) * layout.rows + row_sums)
+        self._derivatives = scalar((kernels.SUM_PARTS + self._decay_parts) * layout.rows + sum_rows)
         # Derivative of the loss with respect to the displacements of a frame.
         self._loss = vector(layout.rows)
         self._allocated_for, self._backoff = (layout, plan.grid.steps), Backoff()
@@ -181,17 +181,21 @@ class MotionAdjoint:
         return self._sheet_gradient(gain, work), loads
 
     def _sweep_block(self, first: int, end: int, by_frame: Array, loads: LoadGradient, pause: Pause) -> Array:
-        """Sweep backward over a block of segments; return the work of the loads on p after step 0 and in step 0."""
+        """Sweep backward over a block of segments.
+
+        Returns:
+            Work of the loads, the sum of p . force, over all steps but step 0, and in step 0, shape (2,).
+        """
         table, h = self._forward.step_table(first, end - first), self.plan.grid.step
         by_slot = np.zeros((end - first, len(self.plan.slots), kernels.LOAD_DERIVATIVES))
-        at = end
+        stop = end
         for begin in reversed(range(first, end, self._segment)):
-            self._store_shapes(begin, table[begin - first : at - first], pause)
-            while at > begin:
-                to = self._launch_begin(begin, at)
-                rows = slice(to - first, at - first)
-                by_slot[rows] = self._sweep(begin, at, by_frame, table[rows])
-                at = to
+            self._store_history(begin, table[begin - first : stop - first], pause)
+            while stop > begin:
+                start = self._launch_begin(begin, stop)
+                rows = slice(start - first, stop - first)
+                by_slot[rows] = self._sweep(begin, stop, by_frame, table[rows])
+                stop = start
                 pause()
         if first == 0:
             # The first step has another gain.
@@ -203,24 +207,24 @@ class MotionAdjoint:
         return np.array([work[int(first == 0) :].sum(), work[: int(first == 0)].sum()])
 
     def _store_checkpoint(self, segment: int) -> None:
-        sheet, first = self._forward.sheet.kernel.arrays, segment * self._shape_entries
-        self._copy_shape(0, first, sheet.u, self._checkpoints)
-        self._copy_shape(0, first, sheet.d, self._checkpoint_differences)
+        sheet, first = self._forward.sheet.kernel.arrays, segment * self._step_entries
+        self._copy_step(0, first, sheet.u, self._checkpoints)
+        self._copy_step(0, first, sheet.d, self._checkpoint_differences)
 
     @property
-    def _shape_entries(self) -> int:
+    def _step_entries(self) -> int:
         return self.layout.rows * self.layout.width
 
-    def _copy_shape(self, from_entry: int, to_entry: int, source: list[Any], target: list[Any]) -> None:
+    def _copy_step(self, from_entry: int, to_entry: int, source: list[Any], target: list[Any]) -> None:
         with compilation_options():
-            kernels.copy_kernel(self.layout.config)(self._shape_entries, from_entry, to_entry, *source, *target)
+            kernels.build_copy(self.layout.config)(self._step_entries, from_entry, to_entry, *source, *target)
 
-    def _store_shapes(self, first: int, table: Array, pause: Pause) -> None:
+    def _store_history(self, first: int, table: Array, pause: Pause) -> None:
         """Repeat a segment from its checkpoint with a table of loads, and store the displacements of all steps."""
         layout, count = self.layout, len(table) - 1
-        checkpoint = first // self._segment * self._shape_entries
-        self._copy_shape(checkpoint, 0, self._checkpoints, self._shapes)
-        self._copy_shape(checkpoint, 0, self._checkpoint_differences, self._differences)
+        checkpoint = first // self._segment * self._step_entries
+        self._copy_step(checkpoint, 0, self._checkpoints, self._history)
+        self._copy_step(checkpoint, 0, self._checkpoint_differences, self._differences)
         max_steps = self._max_launch_steps()
         for done in range(0, count, max_steps):
             steps = min(max_steps, count - done)
@@ -229,19 +233,23 @@ class MotionAdjoint:
                 kernels.build_store,
                 sizes,
                 table[done : done + steps],
-                *self._shapes,
+                *self._history,
                 *self._differences,
                 *self._sheet_arrays,
             )
             pause()
 
     def _launch_begin(self, first: int, end: int) -> int:
-        """Return the first step of a launch that ends at step `end`; a launch is within a segment and a frame."""
+        """Return the first step of the launch that ends at step `end`, in the same segment and frame."""
         frame = (end - 1) // self.plan.grid.steps_per_frame * self.plan.grid.steps_per_frame
         return max(first, frame, end - self._max_launch_steps())
 
     def _sweep(self, first: int, end: int, by_frame: Array, table: Array) -> Array:
-        """Sweep backward from step `end` of a segment; return the derivatives by load, shape (steps, slots, 5)."""
+        """Sweep backward from step `end` of the segment that begins at `first`, over the steps of a table of loads.
+
+        Returns:
+            Derivatives with respect to the loads, shape (steps, slots, 5).
+        """
         layout, grid, count = self.layout, self.plan.grid, len(table)
         frame, steps_after_frame = divmod(end - count, grid.steps_per_frame)
         if not steps_after_frame:
@@ -255,7 +263,7 @@ class MotionAdjoint:
             table,
             by_row,
             *self._adjoint,
-            *self._shapes,
+            *self._history,
             *self._sheet_arrays,
             self._derivatives,
         )
@@ -265,17 +273,17 @@ class MotionAdjoint:
     def _write_loss(self, by_displacement: Array) -> None:
         for c in range(3):
             write_vectors(self._loss[c], to_lanes(self.layout, by_displacement[..., c]))
-        self._copy_shape(0, kernels.LOSS * self._shape_entries, self._loss, self._adjoint)
+        self._copy_step(0, kernels.LOSS * self._step_entries, self._loss, self._adjoint)
 
     def _sheet_gradient(self, gain: float, work: Array) -> SheetGradient:
         layout = self.layout
         rows, cols, derivatives = layout.rows, layout.cols, self._derivatives.to_numpy()
         parts = from_lanes(layout, derivatives, kernels.SUM_PARTS * rows).reshape(kernels.SUM_PARTS, rows, cols)
         first = (kernels.SUM_PARTS + self._decay_parts) * rows * layout.width
-        # The sums of a row are added lane by lane, and then row by row.
+        # The sums are added over the lanes of a row, and then over the rows.
         row_sums = derivatives[first : first + kernels.ROW_SUMS * rows].reshape(rows, kernels.ROW_SUMS, -1)
         sums = row_sums.sum(axis=2).sum(axis=0)
-        # In the order of the constants in `kernel_motion`.
+        # In the order of `SPRING_PARTS` and `KEEP_SUM` in `kernel_motion`.
         along_rows, along_columns, diagonals, foundation = parts
         springs = along_rows[:, :-1], along_columns[:-1], diagonals[:-1, :-1]
         ends = kernels.TENSION_SUMS, kernels.BENDING_SUM, kernels.LOCK_SUMS, kernels.FOUNDATION_LOCK_SUMS
@@ -293,14 +301,14 @@ class MotionAdjoint:
         return arrays.constants, arrays.by_column, arrays.stiffness, arrays.fields
 
     def _max_launch_steps(self) -> int:
-        # Steps times mass points take about 0.1 s of one core.
+        # Steps times mass points of about 0.1 s on one core.
         return max(1, 10_000_000 // (self.layout.rows * self.layout.cols))
 
-    def _sizes(self, count: int, shape: int, moment_row: int, with_loss: bool = False) -> NDArray[np.int64]:
+    def _sizes(self, count: int, u_step: int, moment_row: int, with_loss: bool = False) -> NDArray[np.int64]:
         layout = self.layout
         carry = moment_row + MOMENT_ROWS * layout.workers
         return np.array([
-            count, layout.workers, layout.rows, layout.strip, shape, moment_row, carry, self._carried_rows,
+            count, layout.workers, layout.rows, layout.strip, u_step, moment_row, carry, self._carried_rows,
             MAX_WAIT_CHECKS, self._buffer if moment_row == kernels.ADJOINT_PARTS * layout.rows else 0, with_loss,
         ])  # fmt: skip
 

@@ -1,7 +1,7 @@
 """Adjoint of the quasi-static equilibrium: one linear solution per frame.
 
-At equilibrium F(u) = 0. A change f of the forces changes u by K^-1 f, where K = -F'(u) is the tangent stiffness, and
-the loss by p . f, where p solves K p = l with the derivative l of the loss with respect to u.
+At equilibrium F(u) = 0. A change f of the forces changes u by K^-1 f, with the tangent stiffness K = -F'(u), and the
+loss by p . f. The adjoint p solves K p = l, where l is the derivative of the loss with respect to u.
 """
 
 from __future__ import annotations
@@ -122,6 +122,7 @@ class RestAdjoint:
         return gradient, loads
 
     def _add_loads(self, loads: LoadGradient, frame: int, at_frame: Schedule, p: Array) -> None:
+        """Add the derivatives with respect to the loads of a frame, for the adjoint p."""
         scene, by_slot = self.plan.scene, np.zeros((1, len(at_frame.slots), 5))
         for n, slot in enumerate(at_frame.slots):
             probe, at = scene.probes[slot.probe], at_frame.point[0, n]
@@ -134,6 +135,7 @@ class RestAdjoint:
 
 
 def _add_springs(gradient: SheetGradient, families: Sequence[SpringFamily], u: Array, p: Array) -> None:
+    """Add the derivatives with respect to the numbers of the springs, for an adjoint p at displacements u."""
     for n, family in enumerate(families):
         q, edges, square_difference, square = family.elongation(u)
         p_difference = p[family.start] - p[family.end]
@@ -173,7 +175,7 @@ def _laplacian(plan: Plan) -> Any:
     (rows, cols), (dx, dy) = plan.scene.sheet.points, spacing(plan.scene.sheet)
 
     def second_difference(count: int, h: float) -> tuple[Any, Any]:
-        """Return the second difference along a line, and the selection of its inner mass points."""
+        """Return the matrices of the second difference along a line, and of the selection of its inner mass points."""
         inner = sparse.eye(count - 2, count, 1) if count > 2 else sparse.csr_matrix((0, count))
         neighbours = sparse.eye(count - 2, count) + sparse.eye(count - 2, count, 2) if count > 2 else inner
         return (neighbours - 2 * inner) / h**2, inner
@@ -183,7 +185,7 @@ def _laplacian(plan: Plan) -> Any:
 
 
 def _run_interruptibly(work: Callable[[], Array | None], pause: Pause) -> Array | None:
-    """Run a function in a thread and call `pause` meanwhile; an exception from it abandons the thread."""
+    """Run a function in a thread and call `pause` meanwhile; an exception from `pause` abandons the thread."""
     future: Future[Array | None] = Future()
 
     def finish() -> None:

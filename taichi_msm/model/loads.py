@@ -5,8 +5,8 @@ Step n uses the load averaged with the hat function of half-width h about t_n,
     percent_n = integral of percent(t) (1 - |t - t_n| / h) dt / h,    at n = 0 twice that over [0, h].
 
 The averaged load displaces a free mass point by exactly the same distance as the load itself. The method therefore
-keeps order 2 for every load, including one that jumps between steps. If no keyframe lies within the hat, the average is
-the value at t_n. The activity of the virtual springs is averaged in the same way.
+keeps order 2 for every load, including one that jumps between steps. The average is the value at t_n if the hat
+contains no keyframe. The activity of the virtual springs is averaged in the same way.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ class Schedule(NamedTuple):
     """Loads at consecutive steps or given times."""
 
     slots: tuple[ProbeSlot, ...]  # the second axis of `strength` and `point`
-    strength: Array  # force at the control point before the decay [N], shape (steps, slots, 3)
+    strength: Array  # force without decay [N], shape (steps, slots, 3)
     point: Array  # control point, x and y at rest [m], shape (steps, slots, 2)
     active: Array  # active share of the virtual springs' stiffness, 0 to 1, shape (steps,)
 
@@ -41,7 +41,7 @@ class Schedule(NamedTuple):
 def decay(probe: Probe, sheet: Sheet, at: Array | None = None) -> Array:
     """Return the decay factor of a probe's force at each mass point, shape (rows, cols).
 
-    With `total` it is multiplied by the mass point's share of a cell's area.
+    The factor of a probe with `total` includes the mass point's share of a cell's area.
 
     Args:
         probe: force-controlled probe.
@@ -57,7 +57,7 @@ def decay(probe: Probe, sheet: Sheet, at: Array | None = None) -> Array:
 def decay_gradient(probe: Probe, sheet: Sheet, at: Array | None = None) -> Array:
     """Return the derivatives of `decay` by x and y of the control point [1/m], shape (2, rows, cols).
 
-    They are 0 at the control point itself, where the decay has no derivative.
+    A mass point at the control point has the derivative 0; the decay has none there.
 
     Args:
         probe: force-controlled probe.
@@ -107,10 +107,10 @@ def evaluate_loads(plan: Plan, t: Array) -> Schedule:
 
     Args:
         plan: supplies the probes.
-        t: times [s] other than those of keyframes, shape (n,).
+        t: times [s], shape (n,); at a jump the loads are those after it.
 
     Returns:
-        Loads at these times, in place of steps.
+        Loads at these times; the first axis of its arrays is (n,) instead of (steps,).
     """
     scene = plan.scene
     slots = plan.slots if scene.time.at_rest else probe_slots(scene.probes, scene.sheet, 0.0)
@@ -144,7 +144,7 @@ class FrameLoad:
     def at(self, frame: int, rate: float) -> tuple[float, Array]:
         """Return the load [%] and the control point, x and y at rest [m], shape (2,), at a frame.
 
-        At a jump the values after the jump count.
+        At a jump these are the values after it.
 
         Args:
             frame: number of the frame.
@@ -160,9 +160,9 @@ class FrameLoad:
 def evaluate_frame_loads(plan: Plan, frame: int) -> Schedule:
     """Evaluate the loads at a frame, as a schedule of one step.
 
-    At a jump the value after the jump counts. A keyframe within FRAME_TOLERANCE frames of the frame counts as at the
-    frame. A foundation that is active only under load is active while the percent of any probe differs from 0, and from
-    the first to the last keyframe of any path.
+    At a jump the loads are those after it. A keyframe within FRAME_TOLERANCE frames counts as at the frame. A
+    foundation with `foundation_active: loaded` is active if any load differs from 0, or if any path has begun and not
+    ended.
 
     Args:
         plan: supplies the probes and the frame rate.
@@ -194,7 +194,11 @@ def _all_key_times(scene: Scene) -> Array:
 
 
 class LoadBounds:
-    """Bounds of the loads over time intervals."""
+    """Bounds of the loads over time intervals.
+
+    Args:
+        plan: supplies the probes, their slots and the step.
+    """
 
     def __init__(self, plan: Plan) -> None:
         scene, self._h = plan.scene, plan.grid.step
@@ -215,7 +219,7 @@ class LoadBounds:
             Largest force at the control point of each slot [N], shape (slots,); whether the virtual springs are active
             at any time; and the number of their activations.
         """
-        # The averaged load of a step depends on the whole hat.
+        # The hat of a step extends one step beyond the interval.
         begin, end = begin - self._h, end + self._h
         forces = [force * load.max_abs(begin, end) for force, load in zip(self._forces, self._lines, strict=True)]
         activations = self._begins.searchsorted(end, "right") - self._begins.searchsorted(begin, "left")
@@ -225,7 +229,11 @@ class LoadBounds:
 class _PiecewiseLinear:
     """A piecewise linear function of time [s], 0 before the first keyframe and constant after the last.
 
-    The times of the keyframes are ascending. It jumps where two keyframes have the same time.
+    It jumps where two keyframes have the same time.
+
+    Args:
+        times: ascending times of the keyframes [s], shape (n,).
+        values: values at the keyframes, shape (n,).
     """
 
     def __init__(self, times: Array, values: Array) -> None:
@@ -244,15 +252,15 @@ class _PiecewiseLinear:
         return self._values(t, self.times.searchsorted(t, "right"))
 
     def averages(self, t: Array, h: float, begin: float = -math.inf, end: float = math.inf) -> Array:
-        """Average the function with the hat functions of half-width h [s] about t [s], 0 or later.
+        """Return the averages with hat functions of half-width h about the times t, where t >= 0 [s].
 
-        Before `begin` and after `end` [s] the function counts as 0. Where neither a keyframe nor begin nor end lies
-        within the hat, the average is the value at t.
+        The function counts as 0 before `begin` and from `end` on [s]. The average is the value at t if the hat contains
+        no keyframe and neither `begin` nor `end`.
         """
         edges = [edge for edge in (begin, end) if math.isfinite(edge)]
         averages = self.values(t) * ((begin <= t) & (t < end))
         bounds = np.union1d(self.times, edges)
-        # At t = 0 only half a hat exists, and the average of even a straight line differs from its value.
+        # At t = 0 the hat has its right half only, so even the average of a straight line differs from its value.
         uneven = (t <= 0) | (
             bounds.searchsorted(t + h * (1 - HAT_TOLERANCE), "left")
             > bounds.searchsorted(t - h * (1 - HAT_TOLERANCE), "right")
@@ -276,7 +284,7 @@ class _PiecewiseLinear:
         return np.where(after == 0, 0.0, self.after[low] + share * slope)
 
     def _average(self, t: float, h: float, begin: float, end: float) -> float:
-        """Integrate each linear piece by Simpson's rule, which is exact for a product of linear functions."""
+        """Return the average about a time, by Simpson's rule on each piece; exact for products of linear functions."""
         low, high = max(t - h, 0.0 if t <= 0 else -math.inf, begin), min(t + h, end)
         inner = self.times[(self.times > low) & (self.times < high)]
         cuts = np.unique(np.concatenate([[low, high], inner, [t] if low < t < high else []]))
@@ -294,7 +302,7 @@ class _PiecewiseLinear:
 def _distribute_over_slots(
     load: _PiecewiseLinear, jumps: Array, slot_count: int, t: Array, h: float
 ) -> tuple[Array, NDArray[np.intp]]:
-    """Return the percent and the segment of each slot of a probe with jumps, shape (steps, slots)."""
+    """Return the load [%] and the segment number of each slot of a probe with jumps, both of shape (steps, slots)."""
     bounds = np.concatenate([[-math.inf], jumps, [math.inf]])
     first = jumps.searchsorted(t - h * (1 - HAT_TOLERANCE), "right")
     last = jumps.searchsorted(t + h * (1 - HAT_TOLERANCE), "left")
@@ -310,7 +318,7 @@ def _distribute_over_slots(
 
 
 def _control_point(segment: ProbeSegment, t: Array) -> Array:
-    """Interpolate a control point, constant before and after its keyframes; shape (times, 2)."""
+    """Return the control point of a segment at times t [s], constant outside its keyframes [m], shape (times, 2)."""
     return np.stack([np.interp(t, segment.times, segment.points[:, axis]) for axis in range(2)], axis=-1)
 
 
@@ -319,7 +327,7 @@ def _load(probe: Probe) -> _PiecewiseLinear:
 
 
 def _pressing_keys(probe: Probe) -> Sequence[tuple[float, float]]:
-    """Return keyframes of a function that differs from 0 while a probe presses, or between the ends of its path."""
+    """Return keyframes of a function that is nonzero while a probe acts: its load, or 1 along its path."""
     if probe.path is None:
         return probe.load
     begin, end = probe.path[0][0], probe.path[-1][0]
@@ -327,16 +335,16 @@ def _pressing_keys(probe: Probe) -> Sequence[tuple[float, float]]:
 
 
 def _activity(plan: Plan) -> _PiecewiseLinear:
-    """Return the activity of the virtual springs: 1 if always active or while any probe presses, else 0."""
+    """Return the activity of the virtual springs: 1 if always active or while any probe acts, else 0."""
     scene = plan.scene
     if plan.material.always_active:
-        # A keyframe before every time [s].
+        # One keyframe [s], before any run.
         return _PiecewiseLinear(np.array([-1e300]), np.array([1.0]))
     probe_keys = [_pressing_keys(probe) for probe in scene.probes]
     times = np.unique([time for keys in probe_keys for time, _ in keys])
     if not times.size:
         return _PiecewiseLinear(np.zeros(1), np.zeros(1))
-    # A time within each interval between keyframes, and one after the last.
+    # A time inside each interval between keyframes, and one after the last keyframe.
     middles = np.append((times[:-1] + times[1:]) / 2, times[-1] + 1)
     active = np.zeros(len(times))
     for keys in probe_keys:

@@ -33,17 +33,17 @@ class ProbeSegment(NamedTuple):
 
 @dataclass(frozen=True)
 class ProbeSlot:
-    """One of the control points at which a probe can act in the same step.
+    """One of the control points at which a probe acts in the same step.
 
-    If the control point jumps within the hat, the probe acts in that step both at the point before the jump and at the
-    point after it. The segments of the control point are therefore distributed over two slots in turn. If several jumps
-    can fall within one hat, the probe has one slot more than the largest number of jumps within a hat.
+    In a step whose hat contains a jump of the control point, the probe acts both at the point before and at the point
+    after the jump. A probe has one slot more than the largest number of jumps in a hat, and its segments belong to the
+    slots in turn.
     """
 
     probe: int  # index of the probe in the scene
     segments: tuple[ProbeSegment, ...]  # all segments of the control point, including those of other slots
-    turn: int  # index of the slot's first segment
-    turns: int  # number of slots of the probe; the slot has every `turns`-th segment from `turn` on
+    first_segment: int  # index of the slot's first segment
+    slot_count: int  # number of slots of the probe; the slot has the segments first_segment + n slot_count, n >= 0
 
     @property
     def moves(self) -> bool:
@@ -62,7 +62,7 @@ def probe_slots(probes: Sequence[Probe], sheet: Sheet, h: float) -> tuple[ProbeS
     Args:
         probes: all probes of a scene; position-controlled tools have no slots.
         sheet: supplies the size that converts `probe.at` to metres.
-        h: half-width of the hat, the step [s]; with 0, loads are not averaged and every probe has one slot.
+        h: half-width of the hat, equal to the time step [s]; 0 for loads without averages, with one slot per probe.
 
     Returns:
         Slots in the order of the probes.
@@ -76,14 +76,14 @@ def probe_slots(probes: Sequence[Probe], sheet: Sheet, h: float) -> tuple[ProbeS
         segments = tuple(map(ProbeSegment, np.split(times, jumps), np.split(points, jumps)))
         jump_times = times[jumps]
         hat_ends = jump_times + 2 * h * (1 - HAT_TOLERANCE)
-        within = np.searchsorted(jump_times, hat_ends, "left") - np.arange(len(jump_times))
-        turns = 1 + int(within.max(initial=0))
-        slots += [ProbeSlot(index, segments, turn, turns) for turn in range(turns)]
+        jumps_in_hat = np.searchsorted(jump_times, hat_ends, "left") - np.arange(len(jump_times))
+        slot_count = 1 + int(jumps_in_hat.max(initial=0))
+        slots += [ProbeSlot(index, segments, first, slot_count) for first in range(slot_count)]
     return tuple(slots)
 
 
 def build_slots(scene: Scene, grid: TimeGrid) -> tuple[ProbeSlot, ...]:
-    """Build the slots of a scene's probes; in a quasi-static scene loads are not averaged.
+    """Build the slots of a scene's probes, one per probe in a quasi-static scene.
 
     Args:
         scene: supplies the probes and the kind of motion.
@@ -107,7 +107,7 @@ class Plan:
     grid: TimeGrid  # frames, steps and precision
     slots: tuple[ProbeSlot, ...]  # control points of the force-controlled probes
     tools: tuple[Tool, ...]  # position-controlled tools
-    sha256: Mapping[str, str] = field(default_factory=dict)  # checksums of camera files, by the scene's keys
+    sha256: Mapping[str, str] = field(default_factory=dict)  # checksums of camera files, by key of the scene
 
     @property
     def open_edges(self) -> bool:

@@ -68,7 +68,7 @@ def fixed_points(sheet: Sheet) -> NDArray[np.bool_]:
 
 
 def fixed_sides(sheet: Sheet) -> tuple[Side, ...]:
-    """Return the sides of which every mass point is fixed."""
+    """Return the sides whose mass points are all fixed."""
     if isinstance(sheet.fixed, str):
         return tuple(SIDES) if sheet.fixed == "border" else ()
     return sheet.fixed
@@ -95,9 +95,9 @@ Maps = Mapping[str, MapImage]
 
 
 class LockNumbers(NamedTuple):
-    """Numbers of a law that locks, see `terms.law`."""
+    """Parameters of a locking law, see `terms.law`."""
 
-    lock: float  # m: strain of a spring; of the foundation a depth [m]
+    lock: float  # elongation m at which the law locks: strain of a spring, or depth of the foundation [m]
     factor: float  # largest tangent stiffness, relative to the initial one
 
     @property
@@ -108,7 +108,7 @@ class LockNumbers(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Material:
-    """The coefficients of a sheet, for factors of 1 where it has a map."""
+    """The coefficients of a sheet; a map multiplies them by its factors."""
 
     mass: float  # of a mass point [kg]
     drag: float  # C / m [1/s]
@@ -119,11 +119,11 @@ class Material:
     tension: float  # e; the tension of a spring at rest, relative to its stiffness times its length
     virtual: float  # stiffness K of the virtual springs [N/m]; 0 if they are never active
     always_active: bool  # whether the virtual springs are always active; else only under load
-    bending: float  # D dx dy [N m3]
-    stiffening: LockNumbers | None  # of the springs; None if they are linear
+    bending: float  # bending stiffness D times the area of a cell, D dx dy [N m3]
+    stiffening: LockNumbers | None  # locking law of the springs; None if they are linear
     relaxation: tuple[tuple[float, float], ...]  # share and time [s] of every branch
-    virtual_stiffening: LockNumbers | None  # of the virtual springs, its lock in metres; None if they are linear
-    by_area: bool  # whether mass points and springs at an edge are lighter and softer, as in tissue
+    virtual_stiffening: LockNumbers | None  # locking law of the virtual springs; None if they are linear
+    by_area: bool  # whether mass points and springs at an edge are lighter and softer, as with `tissue`
     factors: Array | None  # factor of the stiffness of every cell, shape (rows - 1, cols - 1); None without a map
     virtual_factors: Array | None  # factor of K at every mass point, shape (rows, cols); None without a map
 
@@ -168,7 +168,7 @@ def point_factors(stiffness_map: StiffnessMap, image: MapImage, sheet: Sheet) ->
 
 
 def map_factors(stiffness_map: StiffnessMap, image: MapImage, rows: Array, cols: Array) -> Array:
-    """Interpolate the factors of a stiffness map bilinearly between pixel centres, constant beyond the outermost.
+    """Interpolate the factors of a stiffness map bilinearly between pixel centres; constant beyond the outermost ones.
 
     Args:
         stiffness_map: supplies the factors of black and white.
@@ -230,7 +230,7 @@ def material_key_problems(scene: Scene) -> Iterator[Problem]:
         elif sheet.mass is None and not scene.time.at_rest:
             yield Problem(("sheet", "mass"), "missing; with springs expected a number above 0, in kg")
         if sheet.tolerance is not None:
-            text = f"{sheet.tolerance:g} needs tissue: with springs other points make another sheet; remove tolerance"
+            text = f"{sheet.tolerance:g} needs tissue: with springs the sheet depends on its points; remove tolerance"
             yield Problem(("sheet", "tolerance"), text)
         return
     if scene.tissue.density is None and not scene.time.at_rest:
@@ -238,12 +238,12 @@ def material_key_problems(scene: Scene) -> Iterator[Problem]:
     if scene.springs is not None:
         yield Problem(("springs",), "tissue already gives the stiffness of the sheet; remove springs or tissue")
     if sheet.mass is not None:
-        yield Problem(("sheet", "mass"), "tissue has the mass of density x thickness x area; remove mass")
+        yield Problem(("sheet", "mass"), "with tissue the mass is density x thickness x area; remove mass")
     if scene.damping:
         yield Problem(("damping",), f"{scene.damping:g} N s/m is per point; with tissue set tissue.damping, in 1/s")
     for index, probe in enumerate(scene.probes):
         if probe.force is not None:
-            text = "is per point, so that more points would be pressed deeper; set total, of the whole tool, in newtons"
+            text = "is per point, so more points are pressed deeper; set total, the force of the whole tool, in newtons"
             yield Problem(("probes", index, "force"), text)
 
 
@@ -251,7 +251,7 @@ def tissue_problems(scene: Scene, fixed: NDArray[np.bool_], factors: Array | Non
     """Report impossible values of keys of tissue.
 
     Args:
-        scene: scene without `material_key_problems`.
+        scene: scene for which `material_key_problems` yields nothing.
         fixed: whether each mass point is fixed, shape (rows, cols).
         factors: stiffness factors of the cells, shape (rows - 1, cols - 1); None without a readable map.
 
@@ -283,7 +283,7 @@ def tissue_problems(scene: Scene, fixed: NDArray[np.bool_], factors: Array | Non
         yield Problem(("tissue", "relaxation"), text)
     total = sum(branch.share for branch in tissue.relaxation)
     if total >= 1:
-        text = f"shares of {total:g} in all leave no elastic force; take shares whose sum is below 1"
+        text = f"the sum of shares is {total:g}, which leaves no elastic force; take shares with a sum below 1"
         yield Problem(("tissue", "relaxation"), text)
     if tissue.relaxation and tissue.foundation_stiffness and tissue.foundation_active == "loaded":
         text = "loaded, but tissue that relaxes needs a foundation at all times; set foundation_active: always"

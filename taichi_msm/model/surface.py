@@ -99,9 +99,9 @@ def _interpolate(position: NDArray[np.floating], refine: int, coordinates: Array
 
 
 def _cell_coordinates(coordinates: Array, points: tuple[int, int], refine: int) -> tuple[NDArray[Any], ...]:
-    """Return row i and column j of the cell of each point, its coordinates s and t across and down in it, and a twist.
+    """Return row i and column j of each point's cell, the coordinates s (across) and t (down) in it, and a twist.
 
-    The twist replaces s t of bilinear interpolation; in each small quad it is linear on either side of the diagonal.
+    The twist replaces the product s t of bilinear interpolation. It is linear in each triangle of a small quad.
     """
     (rows, cols), quads = points, refine + 1
     s, t = (coordinates * (cols - 1, rows - 1)).T
@@ -121,7 +121,7 @@ class Surface(NamedTuple):
 
 
 class Solid(NamedTuple):
-    """The shape and position of an instrument at a time."""
+    """An instrument at a time: its shape and position."""
 
     tip: Array  # end of the axis at the sheet [m], shape (3,)
     axis: Array  # unit vector from the tip along the shaft, shape (3,)
@@ -199,7 +199,7 @@ def place_instrument(instrument: Instrument, scene: Scene, position: NDArray[np.
 
 
 def _insert(values: NDArray[np.floating], refine: int, axis: int) -> NDArray[np.floating]:
-    """Insert interpolated values between neighbours along an axis, without changing a bit of the given values."""
+    """Insert interpolated values between neighbours along an axis; the given values keep their bits."""
     intervals = refine + 1
     along = np.moveaxis(values, axis, 0)
     share = np.arange(intervals, dtype=values.dtype).reshape(-1, *(1,) * (along.ndim - 1)) / intervals

@@ -4,11 +4,11 @@ A probe with `force` exerts on a mass point at the distance d from its control p
 
     F = force exp(-falloff max(d - radius, 0) - offset)
 
-A probe with `total` exerts, per area that belongs to a mass point, for any number of mass points
+A probe with `total` exerts a force F per area of a mass point, which is independent of the mesh:
 
-    F = total w(d) / W,    w = exp(-falloff max(d - radius, 0)),    W = pi R^2 + 2 pi (R / falloff + 1 / falloff^2)
+    F = total w(d) / W,    w = exp(-falloff max(d - R, 0)),    W = pi R^2 + 2 pi (R / falloff + 1 / falloff^2)
 
-where W is the integral of w over an infinite sheet and R the radius of the tool's flat end.
+where W is the integral of w over an infinite sheet and R the `radius` of the tool's flat end.
 """
 
 from __future__ import annotations
@@ -69,7 +69,7 @@ def probe_force(probe: Probe, sheet: Sheet) -> ProbeForce:
 
 
 def control_points(probe: Probe, sheet: Sheet) -> tuple[Array, Array]:
-    """Return the times [s], shape (n,), and control points, x and y at rest [m], shape (n, 2), of a probe's keyframes.
+    """Return the keyframes of a control point: times [s], shape (n,), and x and y at rest [m], shape (n, 2).
 
     Args:
         probe: force-controlled probe.
@@ -101,7 +101,7 @@ def point_at(times: Array, points: Array, time: float) -> Array:
         points: control points at the keyframes [m], shape (n, 2).
         time: time [s].
     """
-    # Frame times are rounded, so a keyframe very close to the time counts as reached.
+    # A keyframe within the rounding error of a frame's time counts as reached.
     after = int(np.searchsorted(times, time + 1e-12 * max(1.0, abs(time)), side="right"))
     if after in (0, len(times)):
         return points[min(after, len(times) - 1)]
@@ -152,7 +152,7 @@ class ProbeRecord(TypedDict, total=False):
     total_force: float  # sum over all mass points [N]
     flat_end_force: float  # part of a `total` that acts under the tool's flat end, on a wide sheet [N]
     largest_pressure: float  # largest force on a mass point per area that belongs to it [Pa]
-    # Of a run, at the frame with the largest force on the mass points that are not fixed.
+    # At the frame of a run with the largest force on free mass points.
     greatest_force: float  # [N]
     greatest_force_vector: Sequence[float]  # x, y and z [N]
     greatest_force_time: float  # [s]

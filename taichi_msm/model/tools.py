@@ -1,4 +1,4 @@
-"""Position-controlled tools: shapes that touch the sheet along paths, and clamps. Scene: `probes` with `path`.
+"""Position-controlled tools, `probes` with `path` in a scene: shapes that touch the sheet, and clamps.
 
 A shape (`taichi_msm.shapes`) has the axis c(t) + s a with 0 <= s <= length, where c is its tip and a the unit vector
 along its shaft. It can grip the mass points at its tip.
@@ -28,11 +28,11 @@ from taichi_msm.scene.tools import Probe
 from taichi_msm.shapes import SHAPES
 from taichi_msm.shapes.shape import Shape
 
-# Largest displacement of a rough tool between two equilibria, in its radii. Its force depends on where it first touches
-# each mass point.
+# Largest displacement of a rough tool between two equilibria, in its radii. Its force depends on the place of its first
+# contact with each mass point.
 ROUGH_STRIDE_RADII = 1 / 16
 
-# A larger spacing of the mass points, in radii of the tool, makes the contact force rough and issues a warning.
+# Largest spacing of mass points without a warning, in radii of the tool; a larger one makes the contact force uneven.
 MAX_SPACING_RADII = 0.5
 COARSE_TIP_PHRASE = "which touches few of them"
 
@@ -59,11 +59,11 @@ class Tool:
     shape: Shape
     friction: float  # Coulomb's coefficient; infinite if rough
     grips: tuple[tuple[float, float], ...]  # start and end of every grip [s]
-    stride: float  # largest displacement between two equilibria, and of a shape in a step [m]
+    stride_limit: float  # largest allowed displacement between two equilibria, or (except a clamp's) in a step [m]
 
     @property
     def rough(self) -> bool:
-        """Whether the mass points that it touches stick to it."""
+        """Whether touching mass points stick to the tool."""
         return self.friction == math.inf
 
     @property
@@ -74,8 +74,8 @@ class Tool:
     def max_stride(self, step: float, first: int = 0) -> tuple[float, int]:
         """Find the largest displacement of the tool in a step.
 
-        The displacement is a convex function of the start of the step, as long as no keyframe enters or leaves the
-        step. It is therefore evaluated only where one does.
+        As a function of the step's begin, the displacement is convex between the times at which a keyframe enters or
+        leaves the step. Its maximum is therefore at one of these times.
 
         Args:
             step: time step [s].
@@ -100,7 +100,7 @@ class Tool:
         return x, y, z
 
     def touches(self, positions: Array, t: float) -> bool:
-        """Return whether any position is in or, up to rounding, on the shape.
+        """Return whether any position is inside the shape or, up to rounding, on its surface.
 
         Args:
             positions: positions of mass points [m], shape (n, 3).
@@ -111,7 +111,7 @@ class Tool:
         return bool((depth > -1e-6 * self.radius).any())
 
     def substep_times(self, begin: float, end: float) -> Array:
-        """Divide a time interval so that the tool moves by at most its stride, and if rough straight, in each part.
+        """Divide a time interval into parts with displacements within `stride_limit`; of a rough tool also straight.
 
         Args:
             begin: start of the interval [s].
@@ -120,19 +120,19 @@ class Tool:
         Returns:
             Ends of the parts [s], shape (parts,); the last is `end`.
         """
-        count, max_stride = 1, self.stride * (1 + 1e-9)
+        count, limit = 1, self.stride_limit * (1 + 1e-9)
         while True:
             times = np.linspace(begin, end, count + 1)
             longest = float(np.linalg.norm(np.diff(self.tip_centre(times), axis=0), axis=1).max())
-            if longest <= max_stride:
+            if longest <= limit:
                 bends = self.times[self.rough & (self.times > begin) & (self.times < end)]
                 return np.union1d(times[1:], bends)
-            count = max(count + 1, int(count * longest / max_stride))
+            count = max(count + 1, int(count * longest / limit))
 
 
 @dataclass(frozen=True, eq=False)
 class Clamp(Tool):
-    """A side of the sheet that is held from the start; `tip_centres` and `heights` are its displacements."""
+    """A clamp on a side of the sheet; `tip_centres` are its displacements, `heights` their z."""
 
     side: Side
     points: NDArray[np.bool_]  # whether the clamp holds each mass point, shape (rows, cols)
@@ -145,7 +145,7 @@ class Clamp(Tool):
 
 
 def touching_tools(tools: Sequence[Tool]) -> list[Tool]:
-    """Return the tools that have a shape, which touches the sheet, in their order."""
+    """Return the tools with a shape, all but clamps, in their order."""
     return [tool for tool in tools if not isinstance(tool, Clamp)]
 
 
@@ -212,7 +212,7 @@ def grip_frames(grip: tuple[float, float], rate: float) -> range:
 
 
 def path_problems(scene: Scene, tools: Sequence[Tool], grid: TimeGrid) -> Iterator[Problem]:
-    """Report tools inside the sheet at the start or too fast, quasi-static friction, and clamps that hold nothing.
+    """Report tools that begin in the sheet or move too fast, impossible friction, and clamps without mass points.
 
     Args:
         scene: supplies the sheet and the kind of motion.
@@ -238,7 +238,7 @@ def path_problems(scene: Scene, tools: Sequence[Tool], grid: TimeGrid) -> Iterat
 
 
 def friction_problem(tool: Tool, *, at_rest: bool) -> str:
-    """Return a message about friction that the kind of motion does not allow; empty if it does.
+    """Return a message about friction that is impossible in this kind of motion; empty if possible.
 
     Args:
         tool: position-controlled tool.
@@ -266,7 +266,7 @@ def _clamp_problems(clamp: Clamp, scene: Scene) -> Iterator[Problem]:
 def too_fast(tool: Tool, grid: TimeGrid, first: int = 0) -> tuple[int, str] | None:
     """Return the keyframe at the end of the fastest segment, and a message about its speed.
 
-    Return None if the tool is slow enough for the time step, or a clamp.
+    The result is None for a tool that is slow enough for the time step, and for a clamp.
 
     Args:
         tool: position-controlled tool.
@@ -274,11 +274,11 @@ def too_fast(tool: Tool, grid: TimeGrid, first: int = 0) -> tuple[int, str] | No
         first: index of the keyframe before which the path is ignored.
     """
     stride, key = tool.max_stride(grid.step, first)
-    if isinstance(tool, Clamp) or stride <= tool.stride * (1 + 1e-9):
+    if isinstance(tool, Clamp) or stride <= tool.stride_limit * (1 + 1e-9):
         return None
     return key, (
         f"moves {stride:.3g} m in a step of {grid.step:.3g} s, over {tool.shape.max_stride:g} of the radius of its "
-        f"instrument; move at most {tool.stride / grid.step:.3g} m/s, or take a smaller step"
+        f"instrument; move at most {tool.stride_limit / grid.step:.3g} m/s, or take a smaller step"
     )
 
 
@@ -292,9 +292,9 @@ def min_steps_per_frame(tools: Sequence[Tool], grid: TimeGrid, least: int) -> in
     """
 
     def speed_ratio(tool: Tool) -> float:
-        return tool.max_stride(1 / grid.frames_per_second / least)[0] / tool.stride
+        return tool.max_stride(1 / grid.frames_per_second / least)[0] / tool.stride_limit
 
-    # With n times the steps, the largest displacement in a step is at least 1 / n of the previous one.
+    # With n times the steps, the largest displacement in a step is 1 / n of the previous one or more, so repeat.
     while (ratio := max(map(speed_ratio, touching_tools(tools)), default=0.0)) > 1 + 1e-9:
         least = max(least + 1, math.ceil(least * ratio * (1 - 1e-9)))
     return least
@@ -348,7 +348,7 @@ def path_warnings(scene: Scene, tools: Sequence[Tool]) -> Iterator[str]:
 
 
 def overlap(tools: Sequence[Tool], duration: float) -> tuple[int, int, float] | None:
-    """Find two capsules that intersect, at 1025 equidistant times.
+    """Find the first intersection of two capsules, at 1025 equidistant times.
 
     Args:
         tools: position-controlled tools; plates and clamps are skipped.
@@ -377,7 +377,7 @@ def _axis_distance(a: Tool, b: Tool, offset: Array) -> Array:
         np.minimum(*(from_end(offset + s * a.axis, b.axis, b.length) for s in (0, a.length))),
         np.minimum(*(from_end(s * b.axis - offset, a.axis, a.length) for s in (0, b.length))),
     )
-    # Distance of the nearest points of both infinite lines, at the minimum of |offset + s a - t b|, if on the axes.
+    # Distance of the infinite lines, at the minimum of |offset + s a - t b|, if both nearest points lie on the axes.
     normal = np.cross(a.axis, b.axis)
     if (square := float(normal @ normal)) > 1e-12:
         cosine, along_a, along_b = a.axis @ b.axis, offset @ a.axis, offset @ b.axis
@@ -388,7 +388,7 @@ def _axis_distance(a: Tool, b: Tool, offset: Array) -> Array:
 
 
 def gap_to_sheet(tool: Tool, sheet: Sheet) -> float:
-    """Return the distance of a tool at 0 s from the sheet at rest [m], negative where it is in the sheet.
+    """Return the distance of a tool at 0 s from the sheet at rest [m]; the negative depth inside the sheet.
 
     Args:
         tool: position-controlled tool with a shape.

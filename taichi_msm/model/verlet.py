@@ -25,7 +25,7 @@ from taichi_msm.model.plan import Plan
 
 
 class Coefficients(NamedTuple):
-    """The coefficients of a step; complex for a complex plan."""
+    """The coefficients of a step; complex numbers in a complex-step derivative."""
 
     keep: float  # share of the last difference that remains
     gain: float  # displacement per force [m/N]
@@ -42,13 +42,13 @@ def coefficients(plan: Plan) -> Coefficients:
 
 
 def mean_force(plan: Plan, displacement: NDArray[Any], steps: int) -> NDArray[Any]:
-    """Return the mean force that displaces mass points by this much more than all other forces [N].
+    """Return the mean contact force of some steps [N], from the displacements that contact added.
 
-    It is m (1 + g h / 2) / h^2 times the displacement per step, or m / h^2 with backward differences.
+    It is m (1 + g h / 2) / h^2 times the added displacement per step, or m / h^2 with backward differences.
 
     Args:
         plan: supplies the coefficients of the steps.
-        displacement: sum of the displacements by contact over all steps [m], any shape.
+        displacement: sum of the added displacements over the steps [m], any shape.
         steps: number of steps.
     """
     return displacement / (coefficients(plan).gain * steps)

@@ -499,7 +499,7 @@ def _error_record(estimates: RunErrorEstimates) -> dict[str, Any] | None:
         fields = dict.fromkeys(keys) | {"at_least": False}
     else:
         return None
-    if estimate is not None and not estimate.parted:
+    if estimate is not None and not estimate.separate:
         fields |= {"rounding": None, "in_f64": None}
     if mesh is not None:
         fields |= {"mesh_error": mesh.error, "mesh_doubt": mesh.doubt}

@@ -1,4 +1,4 @@
-"""Shapes of tools: the table of them, and a file per shape."""
+"""Shapes of tools: their table, and a file per shape."""
 
 from taichi_msm.shapes.capsule import Capsule
 from taichi_msm.shapes.plate import Plate

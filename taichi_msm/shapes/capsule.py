@@ -12,7 +12,7 @@ from taichi_msm.shapes.shape import MIN_DISTANCE_M, Array, Shape
 
 
 class Capsule(Shape):
-    """A capsule."""
+    """A rod with round ends."""
 
     name = "capsule"
     max_stride = 0.5

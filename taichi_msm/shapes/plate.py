@@ -11,12 +11,12 @@ import numpy as np
 from taichi_msm.arithmetic import NUMPY, Operations
 from taichi_msm.shapes.shape import MIN_DISTANCE_M, Array, Shape
 
-# A ray that is more nearly parallel to a plane or to the axis does not intersect it.
+# Lower bound of divisors, for rays parallel to the axis or to the ends.
 MIN_COSINE = 1e-12
 
 
 class Plate(Shape):
-    """A cylinder with flat ends. Points under an end are pushed along the axis, so that strides are short."""
+    """A cylinder with flat ends. Its strides must be short, because points under an end are pushed along the axis."""
 
     name = "plate"
     max_stride = 0.05
@@ -31,7 +31,7 @@ class Plate(Shape):
             distance = sqrt(r_x * r_x + r_y * r_y + r_z * r_z)
             divisor = maximum(distance, MIN_DISTANCE_M)
             outside_side, outside_end = distance - radius, maximum(s * (-1.0), s - length)
-            # A point inside leaves through an end unless the side is 8 times nearer; points near the rim stay under it.
+            # An end counts as nearest unless the side is 8 times nearer, so points near the rim stay under the end.
             is_side = outside_side * 8.0 > outside_end
             sign = where(s < length * 0.5, -1.0, 1.0)
             return (

@@ -1,4 +1,4 @@
-"""Interface of the shape of a tool, shared by NumPy and kernels.
+"""Interface of a tool's shape, shared by NumPy and kernels.
 
 A shape is convex and has an axis, from its tip c along the unit vector a: it lies within `radius` of the points c + s a
 with 0 <= s <= length. Its formulas are plain arithmetic: NumPy calls them as they are, kernels call them wrapped by
@@ -26,30 +26,34 @@ class Shape(ABC):
     """The shape of a tool."""
 
     name: ClassVar[str]  # for messages
-    max_stride: ClassVar[float]  # largest displacement of a tool in a step, in radii
-    is_round: ClassVar[bool] = False  # whether it has all points within `radius` of the axis
+    max_stride: ClassVar[float]  # largest allowed displacement of a tool in a step, in radii
+    is_round: ClassVar[bool] = False  # whether it contains every point within `radius` of the axis
 
     @abstractmethod
     def build_depth(self, operations: Operations) -> Callable[..., Any]:
         """Build the function depth(x, y, z, a_x, a_y, a_z, length, radius) of points relative to the tip [m].
 
-        It returns the depth inside the shape [m], negative outside, and the outward unit normal at the nearest point of
-        its surface, in three components.
+        It returns the depth inside the shape [m], negative outside, and x, y and z of the outward unit normal at the
+        nearest point of its surface.
         """
 
     @abstractmethod
     def build_ray(self, operations: Operations) -> Callable[..., Any]:
         """Build the function intersect(d_d, d_a, o_a, o_d, o_o, length, radius) of lines o + t d relative to the tip.
 
-        d_d is the product d . d, and so on. It returns t where the line enters the shape, whether it does, and numbers
-        `foot` and `end`: the outward normal there is `end` a, if that is not 0, and otherwise o + t d - `foot` a.
+        d_d is the product d . d, and so on. The function returns four values:
+
+        - t at the point where the line enters the shape;
+        - whether it enters;
+        - `foot`, the coordinate of the axis point nearest to it [m];
+        - `end`, the sign of the normal `end` a on a flat end; 0 elsewhere, where the normal is o + t d - `foot` a.
         """
 
     @abstractmethod
     def profile(self, length: float, radius: float) -> Array:
-        """Return the outline that meshes revolve about the axis, from the far end to the tip, shape (points, 4).
+        """Return the profile of the surface of revolution, from the far end to the tip, shape (points, 4).
 
-        The columns are the position along the axis and the distance from it [m], and the same components of the normal.
+        The columns are the axial and radial coordinate [m], and the axial and radial component of the normal.
 
         Args:
             length: length of the axis [m].
@@ -67,12 +71,12 @@ class Shape(ABC):
 
     @abstractmethod
     def gap(self, tip: Array, axis: Array, length: float, radius: float, half: Array) -> float:
-        """Return the distance of the shape from a flat rectangle around the origin [m], negative where it is inside.
+        """Return the distance of the shape from a rectangle at z = 0 around the origin [m]; the negative depth inside.
 
         Args:
             tip: position of the tip [m], shape (3,).
             axis: unit vector from the tip along the shaft, shape (3,).
             length: length of the axis [m].
             radius: radius of the shape [m].
-            half: half the sides of the rectangle, and 0 [m], shape (3,).
+            half: half the sides of the rectangle along x and y, and 0 [m], shape (3,).
         """

@@ -400,8 +400,8 @@ def _path_problems(plan: Plan, index: int, before: Probe, given: Probe, now: flo
     if not at_rest and (fault := too_fast(tool, plan.grid, first)):
         yield Problem((*key, "path", fault[0] - first - 1), fault[1])
     deviation = _shape_change(old_tool, tool)
-    if deviation > tool.stride:
-        text = f"changes by {deviation:.3g} m in a step, over {tool.stride:.3g} m; change it gradually"
+    if deviation > tool.stride_limit:
+        text = f"changes by {deviation:.3g} m in a step, over {tool.stride_limit:.3g} m; change it gradually"
         yield Problem((*key, "instrument"), text)
     for n, (begin, end) in enumerate(given.grip):
         has_ended = end <= now + tolerance

@@ -259,6 +259,6 @@ def test_warning_of_energy_growth_without_a_load(active: str, device: Device, me
         assert progress.energy_growth > (3 if grows else 0)
         notes = [note for note in notes_of(made, progress, None) if note.startswith("the energy grew")]
         if grows:
-            message(notes, "after 0.3 s", hide=r"[\d.]+(?= times)")
+            message(notes, "after 0.3 s", hide=r"(?<=factor of )[\d.]+")
         else:
             assert not notes

@@ -232,7 +232,7 @@ def test_warning_of_a_jump() -> None:
     # 0.0025 m per frame.
     assert not notes(4.9 * 0.0025)
     (note,) = notes(5.1 * 0.0025)
-    assert note.startswith("path-dependent at 3 s, frame 3: from the frame before the sheet jumps by 67 %")
+    assert note.startswith("path-dependent at 3 s, frame 3: since the previous frame the sheet jumped by 67 %")
 
 
 def test_second_solution_of_a_unique_equilibrium(device: Device) -> None:
