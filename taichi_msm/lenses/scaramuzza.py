@@ -47,8 +47,8 @@ class Scaramuzza(LensModel):
             t = 2.0 * r / (1.0 + sqrt(1.0 + maximum(b2 * (-4.0), 1.0) * r * r))
             # Lenses of endoscopes need 3 steps, lenses that fold back 5.
             for _ in range(5):
-                # Go to the nearer root of the osculating parabola of h = t - r g, as Newton's method is slow near a fold.
-                # At the fold the discriminant is 0; the limit of the lens is just below it.
+                # Go to the nearer root of the osculating parabola of h = t - r g, as Newton's method is slow near a
+                # fold. At the fold the discriminant is 0; the limit of the lens is just below it.
                 h = t - r * (1.0 + t * t * (b2 + t * (b3 + t * b4)))
                 slope = 1.0 - r * t * (2.0 * b2 + t * (3.0 * b3 + t * (4.0 * b4)))
                 curvature = r * (2.0 * b2 + t * (6.0 * b3 + t * (12.0 * b4)))
