@@ -1,4 +1,4 @@
-"""Picture files, which may be broken or malicious: their size, pixels and checksum."""
+"""Size, pixels and checksum of picture files, which may be corrupt or malicious."""
 
 from __future__ import annotations
 
@@ -24,13 +24,13 @@ PICTURE_SUFFIXES = (".png", ".jpg", ".jpeg", ".webp", ".bmp", ".tif", ".tiff")
 _MODES_16_BIT = ("I;16", "I;16L", "I;16B", "I;16N")
 _MODES = ("1", "L", "LA", "P", "PA", "RGB", "RGBA", "RGBa", "RGBX", "CMYK", "YCbCr", *_MODES_16_BIT)
 
-# Limit of a side: Pillow needs memory and time for every row, even of a picture with a single column.
+# Maximum side [px]. Pillow spends memory and time on every row, even with a single column.
 MAX_SIDE_PX = 65535
 
-# Limit of a file's size [bytes], above that of Pillow's largest picture with four channels of 16 bits.
+# Maximum size of a file [bytes]; Pillow's largest picture, with four channels of 16 bits, is smaller.
 MAX_BYTES = 2**31
 
-# Copies that are read instead of the original files, by the paths of the originals.
+# Path of the copy to read, by the path of the original file.
 _copies: Mapping[str, Path] = {}
 
 
@@ -40,7 +40,7 @@ class PictureError(Exception):
 
 @contextmanager
 def use_copies(copies: Mapping[str, Path]) -> Iterator[None]:
-    """Read copies, by the paths of the originals, instead of the original files within the block."""
+    """Within the block, read copies in place of the originals; `copies` maps original to copy."""
     global _copies
     previous, _copies = _copies, copies
     try:
@@ -58,7 +58,7 @@ def read_rgb(path: str, background: tuple[int, int, int], sha256: str | None = N
         sha256: required SHA-256 of the file, in hexadecimal; any if None.
 
     Returns:
-        The picture. Its colours are converted from the file's colour profile.
+        The picture, converted from the file's colour profile to sRGB.
 
     Raises:
         PictureError: when the file cannot be used or has another SHA-256.
@@ -73,14 +73,14 @@ def read_rgb(path: str, background: tuple[int, int, int], sha256: str | None = N
 def read_grey(path: str, sha256: str | None = None) -> NDArray[Any]:
     """Read the grey values of a picture, in its upright orientation.
 
-    The values are numbers rather than colours, so the colour profile is ignored. Transparent pixels are black.
+    Grey values are data, not colours: the colour profile is ignored. Transparent pixels are black.
 
     Args:
         path: path of the file.
         sha256: required SHA-256 of the file, in hexadecimal; any if None.
 
     Returns:
-        uint16 where the file has 16 bits, else uint8, shape (height, width).
+        Grey values, uint16 for a file of 16 bits, else uint8, shape (height, width).
 
     Raises:
         PictureError: when the file cannot be used or has another SHA-256.
@@ -100,15 +100,15 @@ def picture_size(path: str) -> tuple[int, int]:
     from PIL import Image
 
     with _open(path) as image:
-        # Pillow's size of a TIFF is upright already. The base class's getexif() reads only the header, whereas PNG's
-        # decodes the whole picture. Values 5 to 8 of the orientation, 0x0112, are rotations by 90 degrees.
+        # For TIFF, Pillow swaps width and height itself. The getexif() of the base class reads only the header, that of
+        # PNG decodes the picture. The orientations (tag 0x0112) 5 to 8 swap width and height.
         if image.format != "TIFF" and Image.Image.getexif(image).get(0x0112) in (5, 6, 7, 8):
             return image.height, image.width
         return image.size
 
 
 def has_transparency(path: str) -> bool:
-    """Return whether any pixel of a picture is transparent, even in part."""
+    """Return whether any pixel of a picture is fully or partly transparent."""
     with _open(path) as image:
         return image.has_transparency_data and image.convert("RGBA").getchannel("A").getextrema() != (255, 255)
 
@@ -125,11 +125,11 @@ def file_sha256(path: str) -> str:
 
 @contextmanager
 def _open(path: str, sha256: str | None = None) -> Iterator[Image.Image]:
-    """Open a picture, and convert all errors of Pillow, also those raised in the block, to a PictureError."""
+    """Open and check a picture; raise any error, also of the block, as a PictureError."""
     from PIL import Image, UnidentifiedImageError
 
     _require_file(path)
-    # libtiff and Pillow also print their errors, in addition to the exception.
+    # libtiff and Pillow raise their errors, and print them to stderr.
     with discarded_output(2), warnings.catch_warnings():
         warnings.simplefilter("ignore")
         warnings.simplefilter("error", Image.DecompressionBombWarning)
@@ -137,19 +137,19 @@ def _open(path: str, sha256: str | None = None) -> Iterator[Image.Image]:
             with ExitStack() as opened:
                 file = opened.enter_context(actual_path(path).open("rb"))
                 if sha256 is not None and _sha256(file) != sha256:
-                    raise PictureError(f"{path} is not the file of the run, by its SHA-256; restore that file")
+                    raise PictureError(f"{path} differs from the file of the run (SHA-256); restore the original file")
                 file.seek(0)
                 image = opened.enter_context(Image.open(file, formats=PICTURE_FORMATS))
                 if max(image.size) > MAX_SIDE_PX:
-                    reason = f"has {image.width} x {image.height} pixels; a side may have at most {MAX_SIDE_PX}, cut it"
+                    reason = f"has {image.width} x {image.height} pixels; crop it to at most {MAX_SIDE_PX} a side"
                     raise PictureError(f"{path} {reason}")
                 if image.format in ("JPEG", "MPO"):
                     scans = _count_scans(file)
-                    # Every scan visits all pixels, and encoders write about ten. A small picture may have more, up to
-                    # a number of visits that takes a few seconds.
+                    # A scan is one pass over the picture. Encoders write about ten scans; more are allowed up to 200
+                    # million pixels in all, which take a few seconds.
                     limit = max(16, 200_000_000 // (image.width * image.height))
                     if scans > limit:
-                        raise PictureError(f"{path} has {scans} scans, and {limit} are allowed; save it again")
+                        raise PictureError(f"{path} has {scans} scans, more than {limit}; save it again")
                 if image.mode not in _MODES:
                     raise PictureError(f"{path} has pixels of kind {image.mode}; save it as 8-bit RGB")
                 yield image
@@ -174,14 +174,14 @@ def _sha256(file: BinaryIO) -> str:
 
 
 def _count_scans(file: BinaryIO) -> int:
-    """Count the scans of a JPEG, which may be broken."""
+    """Count the scans of a JPEG file, even of a corrupt one."""
     offset, scans = 2, 0
     with mmap(file.fileno(), 0, access=ACCESS_READ) as data:
         while (offset := data.find(b"\xff", offset)) >= 0 and (marker := data[offset + 1 : offset + 2]) not in (
             b"",
             b"\xd9",
         ):
-            # Stuffed and padding bytes and restarts have no length field; they occur within the data of a scan.
+            # Stuffed bytes, padding and restart markers occur within the data of a scan, without a length field.
             if marker in b"\x00\x01\xff" or b"\xd0" <= marker <= b"\xd8":
                 offset += 1 if marker == b"\xff" else 2
                 continue
@@ -191,9 +191,9 @@ def _count_scans(file: BinaryIO) -> int:
 
 
 def irregular_kind(path: Path) -> str:
-    """Return the kind of a path that is not a regular file, or an empty text for a regular file.
+    """Describe a path that is not a regular file, without opening it; return "" for a regular file.
 
-    The path is not opened, as opening a pipe would block.
+    Opening a pipe would block.
     """
     mode = path.stat().st_mode
     if stat.S_ISREG(mode):
@@ -202,7 +202,7 @@ def irregular_kind(path: Path) -> str:
 
 
 def actual_path(path: str) -> Path:
-    """Return the path of a file's copy (see `use_copies`), or the path of the file."""
+    """Return the path to read: that of the copy within `use_copies`, otherwise `path`."""
     return _copies.get(path) or Path(path)
 
 
@@ -245,10 +245,10 @@ def _to_srgb(path: str, image: Image.Image, profile: bytes | None) -> Image.Imag
     try:
         source = ImageCms.ImageCmsProfile(io.BytesIO(profile))
         space = source.profile.xcolor_space.strip()
-        # Profiles of other spaces than grey and CMYK apply to RGB.
+        # Profiles of any other space apply to RGB pixels.
         mode = {"GRAY": "L", "CMYK": "CMYK"}.get(space, "RGB")
-        pixels = {"L": ("1", "L", "LA"), "CMYK": ("CMYK",)}.get(mode, tuple(m for m in _MODES if m != "CMYK"))
-        if image.mode not in pixels:
+        valid_modes = {"L": ("1", "L", "LA"), "CMYK": ("CMYK",)}.get(mode, tuple(m for m in _MODES if m != "CMYK"))
+        if image.mode not in valid_modes:
             raise PictureError(
                 f"{path} has pixels of kind {image.mode} and a colour profile of {space}; save it as sRGB"
             )
@@ -267,7 +267,7 @@ def _to_srgb(path: str, image: Image.Image, profile: bytes | None) -> Image.Imag
 
 
 def _is_identity(transform: Any) -> bool:
-    """Return whether a transform from RGB to sRGB changes colours by at most 2 of 255, at 16 values per channel."""
+    """Return whether a transform from RGB to sRGB changes 16 x 16 x 16 colours by at most 2 of 255 per channel."""
     import numpy as np
     from PIL import Image, ImageCms
 
@@ -277,7 +277,7 @@ def _is_identity(transform: Any) -> bool:
 
 
 def _to_rgb(image: Image.Image, background: tuple[int, int, int]) -> Image.Image:
-    """Convert pixels of any mode in `_MODES`, except those of 16 bits, to RGB."""
+    """Convert a picture of any mode but 16-bit grey to RGB, with the background behind transparent pixels."""
     from PIL import Image
 
     if not image.has_transparency_data:

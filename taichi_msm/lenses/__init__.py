@@ -1,4 +1,4 @@
-"""Lens models: the table of them, and a file per model."""
+"""Lens models, one per file, and the table of all models."""
 
 from taichi_msm.lenses.fisheye import Fisheye
 from taichi_msm.lenses.model import LensModel

@@ -20,7 +20,7 @@ class Dual:
     value: Array
     slope: Array
 
-    __array_ufunc__ = None  # So that NumPy leaves operators to this class.
+    __array_ufunc__ = None  # NumPy arrays then defer to the operators of this class.
 
     def __add__(self, other: Any) -> Dual:
         value, slope = _parts(other)

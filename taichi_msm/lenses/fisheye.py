@@ -7,7 +7,7 @@ With r = |(x, y)| and t = atan(r),
 Source: OpenCV's documentation of calib3d, "Fisheye camera model".
 """
 
-# Without `from __future__ import annotations`, because Taichi reads the function of a lens.
+# No `from __future__ import annotations`: Taichi compiles the formula.
 
 import math
 from collections.abc import Callable, Sequence
@@ -17,7 +17,7 @@ from numpy.polynomial import Polynomial
 
 from taichi_msm.lenses.model import MAX_RADIUS, Coefficient, LensModel, Operations, positive_roots
 
-# Square of the radius below which the quotient t / r is rounded to 1.
+# Squared radius below which t / r rounds to 1.
 MIN_SQUARED_RADIUS = 1e-16
 
 
@@ -41,7 +41,7 @@ class Fisheye(LensModel):
         return distort
 
     def limit(self, coefficients: Sequence[float]) -> float:
-        """Return the radius at the first maximum of the polynomial in t."""
+        """Return the radius of the first maximum of the distorted radius, at most `MAX_RADIUS`."""
         k1, k2, k3, k4 = coefficients
         fold_angles = positive_roots(Polynomial([0, 1, 0, k1, 0, k2, 0, k3, 0, k4]).deriv())
         return min(MAX_RADIUS, math.tan(min([*fold_angles, math.radians(88)])))

@@ -1,8 +1,8 @@
 """Interface of a lens model.
 
-A lens maps normalised image coordinates (x, y), the intersection of a line of sight with the plane at depth 1 in
-OpenCV's axes (x right, y down), to distorted ones. Its formula is plain arithmetic: NumPy calls it unchanged, kernels
-call it wrapped by Taichi, and with dual numbers it returns its derivatives.
+A lens maps normalised image coordinates to distorted ones. The coordinates (x, y) are those of a line of sight in the
+plane at depth 1, x right and y down as in OpenCV. The formula is plain arithmetic: NumPy calls it unchanged, kernels
+call it wrapped by Taichi, and dual numbers yield its Jacobian.
 """
 
 from __future__ import annotations
@@ -18,10 +18,10 @@ from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
 
-# Maximum valid radius of any lens.
+# Maximum valid radius of any lens: 88 degrees from the optical axis.
 MAX_RADIUS = math.tan(math.radians(88))
 
-# Smaller coefficients have no effect within the maximum radius, and division by them may overflow.
+# Coefficients below this value are treated as 0: they have no effect, and division by them may overflow.
 MIN_COEFFICIENT = 1e-100
 
 MAX_COEFFICIENT = 1e6
@@ -33,7 +33,7 @@ class Operations(NamedTuple):
     sqrt: Callable[..., Any]
     arctan: Callable[..., Any]
     maximum: Callable[..., Any]
-    wrap: Callable[[Callable[..., Any]], Callable[..., Any]]  # makes a function callable in the formula of a lens
+    wrap: Callable[[Callable[..., Any]], Callable[..., Any]]  # makes a Python function callable from the formula
 
 
 NUMPY = Operations(np.sqrt, np.arctan, np.maximum, lambda function: function)
@@ -42,19 +42,19 @@ NUMPY = Operations(np.sqrt, np.arctan, np.maximum, lambda function: function)
 class Coefficient(NamedTuple):
     """A coefficient of a lens model."""
 
-    meaning: str  # for users, with its unit; without one it is a pure number
+    meaning: str  # for users; with the unit, unless dimensionless
     least: float = -MAX_COEFFICIENT
     most: float = MAX_COEFFICIENT
     default: float | None = 0.0  # None if it is required
 
 
 class LensModel(ABC):
-    """A lens model."""
+    """Formula, coefficients and valid radius of a lens model."""
 
     name: ClassVar[str]  # value of `distortion.model`, and of `model` in camera.json
     meaning: ClassVar[str]  # for users
-    coefficients: ClassVar[Mapping[str, Coefficient]]  # in the order of camera.json; at most 8, the space in `uniforms`
-    focal_length: ClassVar[str] = ""  # coefficient that replaces fx and fy; empty without one
+    coefficients: ClassVar[Mapping[str, Coefficient]]  # in the order of camera.json; `uniforms` has room for 8
+    focal_length: ClassVar[str] = ""  # coefficient in place of fx and fy; empty if the model has none
 
     @abstractmethod
     def build(self, operations: Operations) -> Callable[..., Any]:
@@ -62,10 +62,10 @@ class LensModel(ABC):
 
     @abstractmethod
     def limit(self, coefficients: Sequence[float]) -> float:
-        """Return the least radius at which the distortion folds back or has a pole, at most `MAX_RADIUS`."""
+        """Return the valid radius: up to the first fold or pole of the distortion, at most `MAX_RADIUS`."""
 
     def undistort(self, distorted: Array, coefficients: Sequence[float]) -> Array | None:
-        """Return the inverse of the formula in closed form, or None for a model that has none.
+        """Invert the formula in closed form; return None for a model without one.
 
         Args:
             distorted: distorted normalised image coordinates, shape (..., 2).
@@ -84,6 +84,6 @@ class LensModel(ABC):
 
 def positive_roots(polynomial: Polynomial) -> list[float]:
     """Return the positive real roots of a polynomial."""
-    # Leading zeros would add roots at infinity.
+    # A leading coefficient near 0 would add a root near infinity.
     roots = polynomial.trim(MIN_COEFFICIENT).roots()
     return [float(root.real) for root in roots if root.real > 0 and abs(root.imag) <= 1e-9 * abs(root)]

@@ -1,15 +1,15 @@
 """OpenCV's omnidirectional model, after Mei.
 
-The line of sight is projected onto the unit sphere, and from a point xi above its centre onto a plane,
+The line of sight is projected onto the unit sphere, then, from a point at distance xi from its centre, onto a plane,
 
     (u, v) = (x, y) / (1 + xi sqrt(1 + x^2 + y^2)),
 
-where the rational model distorts it, with k1, k2, p1 and p2 only.
+The rational model with k1, k2, p1 and p2 distorts (u, v).
 
 Source: Mei and Rives 2007; OpenCV's documentation of ccalib, "Omnidirectional Camera Calibration".
 """
 
-# Without `from __future__ import annotations`, because Taichi reads the function of a lens.
+# No `from __future__ import annotations`: Taichi compiles the formula.
 
 import math
 from collections.abc import Callable, Sequence
@@ -42,10 +42,10 @@ class Omnidir(LensModel):
         return distort
 
     def limit(self, coefficients: Sequence[float]) -> float:
-        """Return the radius that is projected onto the limit of the rational model."""
+        """Return the radius r that is mapped to the limit m of the rational model."""
         xi, k1, k2, p1, p2 = coefficients
         m = Rational().limit((k1, k2, p1, p2, 0.0, 0.0, 0.0, 0.0))
-        # The radius on the plane grows with r, to 1 / xi.
+        # As r grows, the radius on the plane approaches 1 / xi.
         if m * xi >= 1:
             return MAX_RADIUS
         return min(MAX_RADIUS, m * (1 + xi * math.sqrt(1 + m * m * (1 - xi * xi))) / (1 - m * m * xi * xi))

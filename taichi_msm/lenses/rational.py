@@ -8,7 +8,7 @@ With q = x^2 + y^2,
 Source: OpenCV's documentation of calib3d, "Detailed Description".
 """
 
-# Without `from __future__ import annotations`, because Taichi reads the function of a lens.
+# No `from __future__ import annotations`: Taichi compiles the formula.
 
 import math
 from collections.abc import Callable, Sequence
@@ -49,14 +49,15 @@ class Rational(LensModel):
         return distort
 
     def limit(self, coefficients: Sequence[float]) -> float:
-        """Return the radius of the first zero of the Jacobian's determinant or of the denominator."""
+        """Return the least radius with a zero of the Jacobian's determinant or of the denominator of R."""
         numerator, denominator = _factors(coefficients)
         q = Polynomial([0, 1])
+        # Numerator of d(R r) / dr.
         growth = (numerator + 2 * q * numerator.deriv()) * denominator - 2 * q * numerator * denominator.deriv()
         radial = float(min([MAX_RADIUS, *np.sqrt([*positive_roots(growth), *positive_roots(denominator)])]))
         if math.hypot(*coefficients[2:4]) <= MIN_COEFFICIENT:
             return radial
-        # The first fold due to tangential distortion is searched among these radii, and then refined.
+        # Bracket the first fold due to tangential distortion, then refine it.
         radii = radial * np.linspace(0, 1, 4097)[:-1]
         folded_indices = np.flatnonzero(_min_determinant(coefficients, radii) <= 0)
         if not len(folded_indices):
@@ -80,10 +81,10 @@ def _min_determinant(coefficients: Sequence[float], r: Any) -> Any:
 
         g R - 4 a^2 + 2 a (g + 3 R) c + 16 a^2 c^2,
 
-    where c is the cosine of the angle between the point and (p2, p1). The Jacobian is symmetric, and on the axis it is
-    the identity; so the lens does not fold within a circle where the minimum is positive.
+    where c is the cosine of the angle between the point and (p2, p1). The Jacobian is symmetric, and on the axis the
+    identity: the lens does not fold within a radius up to which the minimum is positive.
     """
-    r = np.maximum(r, 1e-8)  # to divide by a
+    r = np.maximum(r, 1e-8)  # a > 0, for the division
     numerator, denominator = _factors(coefficients)
     q = r * r
     ratio = numerator(q) / denominator(q)

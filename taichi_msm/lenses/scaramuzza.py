@@ -1,15 +1,15 @@
 """Scaramuzza's polynomial model of wide lenses, as OCamCalib, MATLAB's fisheyeIntrinsics and C3VD calibrate it.
 
-The line of sight of a point (u, v) of the sensor [px], at the distance p from the axis, is (u, v, f), and its pixel is
+A point (u, v) of the sensor [px] at distance p from the axis has the line of sight (u, v, f) and the pixel
 
     (c u + d v, e u + v) from the principal point,    f(p) = a0 + a2 p^2 + a3 p^3 + a4 p^4.
 
-So p solves p = r f(p), r = |(x, y)|. In units of the focal length a0: t = p / a0, g(t) = f(p) / a0.
+With r = |(x, y)|, p solves p = r f(p). In units of the focal length a0: t = p / a0, g(t) = f(p) / a0.
 
 Source: Scaramuzza, Martinelli and Siegwart 2006; MATLAB's documentation of fisheyeIntrinsics.
 """
 
-# Without `from __future__ import annotations`, because Taichi reads the function of a lens.
+# No `from __future__ import annotations`: Taichi compiles the formula.
 
 from collections.abc import Callable, Sequence
 from typing import Any, ClassVar
@@ -43,16 +43,16 @@ class Scaramuzza(LensModel):
         def distort(x, y, a0, a2, a3, a4, c, d, e):
             b2, b3, b4 = a0 * a2, a0 * a0 * a3, a0 * a0 * a0 * a4
             r = sqrt(maximum(x * x + y * y, MIN_SQUARED_RADIUS))
-            # The solution with a3 = a4 = 0, at most the stereographic one.
+            # Start at the solution for a3 = a4 = 0, or that of a stereographic lens if smaller.
             t = 2.0 * r / (1.0 + sqrt(1.0 + maximum(b2 * (-4.0), 1.0) * r * r))
-            # Lenses of endoscopes need 3 steps, those that fold back 5.
+            # Lenses of endoscopes need 3 steps, lenses that fold back 5.
             for _ in range(5):
-                # The nearer root of the parabola that touches h = t - r g; Newton's method is slow near a fold. The
-                # discriminant is 0 at the fold, just before which the lens ends.
+                # Go to the nearer root of the osculating parabola of h = t - r g, as Newton's method is slow near a
+                # fold. At the fold the discriminant is 0; the limit of the lens is just below it.
                 h = t - r * (1.0 + t * t * (b2 + t * (b3 + t * b4)))
-                first = 1.0 - r * t * (2.0 * b2 + t * (3.0 * b3 + t * (4.0 * b4)))
-                second = r * (2.0 * b2 + t * (6.0 * b3 + t * (12.0 * b4)))
-                t = t - 2.0 * h / (first + sqrt(maximum(first * first + 2.0 * h * second, 1e-7)))
+                slope = 1.0 - r * t * (2.0 * b2 + t * (3.0 * b3 + t * (4.0 * b4)))
+                curvature = r * (2.0 * b2 + t * (6.0 * b3 + t * (12.0 * b4)))
+                t = t - 2.0 * h / (slope + sqrt(maximum(slope * slope + 2.0 * h * curvature, 1e-7)))
             ratio = t / r
             u, v = x * ratio, y * ratio
             return c * u + d * v, e * u + v
@@ -60,14 +60,14 @@ class Scaramuzza(LensModel):
         return distort
 
     def undistort(self, distorted: Array, coefficients: Sequence[float]) -> Array:
-        # (u, v) / g(t).
+        # The inverse is (u, v) / g(t).
         a0, a2, a3, a4, c, d, e = coefficients
         x, y = np.moveaxis(distorted, -1, 0)
         u, v = np.stack([x - d * y, c * y - e * x]) / (c - d * e)
         t = np.hypot(u, v)
         radial = a0, a2, a3, a4, 1.0, 0.0, 0.0
-        end, _ = self.build(NUMPY)(np.array(self.limit(coefficients)), 0.0, *radial)
-        g = np.where(t < end, 1 + t * t * a0 * (a2 + t * a0 * (a3 + t * a0 * a4)), np.nan)
+        max_t, _ = self.build(NUMPY)(np.array(self.limit(coefficients)), 0.0, *radial)
+        g = np.where(t < max_t, 1 + t * t * a0 * (a2 + t * a0 * (a3 + t * a0 * a4)), np.nan)
         return np.stack([u / g, v / g], axis=-1)
 
     def limit(self, coefficients: Sequence[float]) -> float:
@@ -76,12 +76,12 @@ class Scaramuzza(LensModel):
         t = Polynomial([0, 1])
         g = Polynomial([1, 0, a2 * a0, a3 * a0**2, a4 * a0**3])
         fold = min(positive_roots(g - t * g.deriv()), default=np.inf)
-        end = min([fold, *positive_roots(g - t / MAX_RADIUS)])
-        radial_positions = end * np.sin(np.linspace(0, np.pi / 2, 2048))
+        max_t = min([fold, *positive_roots(g - t / MAX_RADIUS)])
+        radial_positions = max_t * np.sin(np.linspace(0, np.pi / 2, 2048))
         radii = radial_positions / g(radial_positions)
         with np.errstate(all="ignore"):
             roots, _ = self.build(NUMPY)(radii, 0.0, a0, a2, a3, a4, 1.0, 0.0, 0.0)
-        # 1e-6 px at a focal length of 1000 px.
+        # The tolerance is 1e-6 px at a focal length of 1000 px.
         is_wrong = ~(np.abs(roots - radial_positions) <= 1e-9)
         if is_wrong.any():
             return float(radii[max(0, np.argmax(is_wrong) - 1)])

@@ -16,7 +16,7 @@ FIRST_X, FIRST_Y, LAST_X, LAST_Y, BOUNDS_STRIDE = range(5)
 # Limit of coordinates, so that they fit into an integer.
 MAX_BOUND = 1e6
 
-# Maximum number of entries of all lists, per cell and per bin.
+# Maximum number of entries of all lists, divided by the number of cells and bins together.
 MAX_MEAN_ENTRIES = 64
 
 # Maximum number of rounds of a binary search among the cells of a sheet.
@@ -37,7 +37,7 @@ def build_bins(launches: Launches, bounds: Any, cells: int, extent: tuple[int, i
     """Build the bins of a picture: sequentially on a CPU, in parallel on a GPU.
 
     Args:
-        launches: launches on the device; bounded ones, of a GPU, select the parallel kernels.
+        launches: launches on the device; if `bounded`, as on a GPU, the kernels are parallel.
         bounds: bounding boxes as stored by `store_bounds`, on the device, shape (cells * BOUNDS_STRIDE,).
         cells: number of cells.
         extent: width and height of the picture, in the unit of the bounds.
@@ -149,7 +149,7 @@ def _count_cells(cells: ti.i32, size: ti.i32, columns: ti.i32, bounds: Integers,
 
 @ti.kernel
 def _list_cells(cells: ti.i32, size: ti.i32, columns: ti.i32, bounds: Integers, ends: Integers, entries: Integers):
-    """List the cells of every bin; `ends` holds the start of each list, and afterwards its end."""
+    """List the cells of every bin; `ends` holds the start of each list before, and its end after."""
     ti.loop_config(serialize=True)
     for cell in range(cells):
         left, right, top, bottom = _bin_range(cell, size, bounds)
@@ -187,7 +187,7 @@ def _assign_entries(
     for entry in range(first, end):
         cell = owner_of(entry, cells, ends)
         left, right, top, bottom = _bin_range(cell, size, bounds)
-        # The cell's entries are the last ones before its end.
+        # Number of the entry among those of the cell, which end at `ends[cell]`.
         n = (right - left) * (bottom - top) + entry - ends[cell]
         bins[entry] = (top + n // (right - left)) * columns + left + n % (right - left)
         positions[entry] = ti.atomic_add(counts[bins[entry]], 1)

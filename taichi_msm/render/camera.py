@@ -21,7 +21,8 @@ from taichi_msm.scene.section import FRAME_TOLERANCE, MAX_SUPERSAMPLE, MIN_MAGNI
 
 Array = NDArray[np.float64]
 
-# Presets oblique and fit: direction of the eye, 50 degrees above the sheet at its lower edge; field of view [degrees].
+# Presets oblique and fit: direction to the eye, 50 degrees above the sheet and from its lower edge; field of view
+# [degrees].
 OBLIQUE_DIRECTION = np.array([0.0, -0.64, 0.77])
 OBLIQUE_FOV = 32.0
 
@@ -39,8 +40,8 @@ class View(NamedTuple):
 
         x = centre_x + right / w scale_x,    y = centre_y - up / w scale_y    [px]
 
-    from the top-left corner, with w = depth for a pinhole camera, and w = 1 for the orthographic one. Lens distortion
-    is applied to these pixels.
+    from the upper left corner, where w is the depth for a pinhole camera, and 1 for the orthographic one. Lens
+    distortion maps these pixels to those of the picture.
     """
 
     matrix: Array  # maps (x, y, z, 1) [m] to (X, Y, w, depth) with x = X / w, y = Y / w, shape (4, 4)
@@ -50,12 +51,12 @@ class View(NamedTuple):
     scale: Array  # pixels per metre at w = 1, horizontal and vertical, shape (2,)
     centre: Array  # principal point [px], shape (2,)
     size: Array  # width and height of the picture [px], shape (2,)
-    distance: float  # of the eye from the target [m]; for a moving camera at the start
+    distance: float  # from the eye to the target [m]; the initial one for a moving camera
     pinhole: bool  # whether the projection is perspective
     lens: Lens | None = None
     baseline: float = 0.0  # distance to the companion of a parallel stereo pair, along the x axis [m]
-    companion: View | None = None  # second camera of the stereo pair: the first whose `beside` names this camera
-    light_view: View | None = None  # the camera at the light; None if it is this camera
+    companion: View | None = None  # second camera of the stereo pair: the first one with this camera as `beside`
+    light_view: View | None = None  # camera that carries the light; None if it is this camera
 
     @property
     def lens_model(self) -> str:
@@ -106,12 +107,12 @@ class View(NamedTuple):
         return self.centre + self.scale * self.lens.undistort((pixels - self.centre) / self.scale)
 
     def disparity(self, depth: NDArray[np.float32]) -> NDArray[np.float32]:
-        """Return the disparity to the companion camera of a stereo pair without lens distortion [px], 0 at depth 0."""
+        """Return the disparity to the companion camera [px], 0 at depth 0; for cameras without lens distortion."""
         w = np.where(depth == 0, np.inf, depth if self.pinhole else 1.0)
         return (self.scale[0] * self.baseline / w).astype(np.float32)
 
     def centred_at(self, pixel: tuple[float, float]) -> View:
-        """Return a view with X = Y = 0 on the line of sight through a pixel's centre; the first pixel is (0, 0)."""
+        """Return the view moved so that X = Y = 0 along the line of sight of a pixel's centre; the first is (0, 0)."""
         matrix, centre = self.matrix.copy(), self.undistort(np.array(pixel) + 0.5)
         for row in (0, 1):
             matrix[row] -= centre[row] * matrix[2]
@@ -122,11 +123,12 @@ def calibration(camera: View) -> dict[str, Any]:
     """Return the matrices of a camera in the conventions of other programs.
 
     Returns:
-        "projection": 3 x 4 matrix P from the world to pixels, counted from the picture's upper left corner, without
-        lens distortion. For a pinhole camera also, in OpenCV's axes (x right, y down, z forward), "pose": 3 x 4 matrix
-        from the world to the camera; "intrinsics": 3 x 3 matrix to the same pixels; "calibration": 3 x 3 matrix to
-        OpenCV's pixels, where the centre of the first one is (0, 0); "model" and "distortion": lens model and its
-        coefficients in its order.
+        "projection", 3 x 4: from the world to pixels without lens distortion, with the upper left corner at (0, 0).
+
+        For a pinhole camera also the following, in OpenCV's axes (x right, y down, z forward). "pose", 3 x 4: from the
+        world to the camera. "intrinsics", 3 x 3: from the camera to the same pixels. "calibration", 3 x 3: from the
+        camera to OpenCV's pixels, where the centre of the first pixel is (0, 0). "model" and "distortion": lens model
+        and its coefficients.
     """
     projection = {"projection": camera.matrix[:3].tolist()}
     if not camera.pinhole:
@@ -180,7 +182,7 @@ def view_at(scene: Scene, time: float, name: str = "") -> View:
 
 
 def _view_of(scene: Scene, time: float, name: str) -> View:
-    """Resolve a camera without its companion and its light."""
+    """Return the view of a camera, without companion and light view."""
     camera, baseline = scene.render.origin(name)
     if camera == "top":
         result = _top(scene)
@@ -196,21 +198,21 @@ def _view_of(scene: Scene, time: float, name: str) -> View:
 
 
 def _companion(camera: Camera, scene: Scene, reference: View) -> View:
-    """Resolve a camera with a rotation and a translation from its reference camera: X_this = R X_reference + T."""
+    """Return the view of a camera posed relative to a reference camera: X_this = R X_reference + T."""
     rotation, translation = (np.array(pair_transform(camera)[key]) for key in ("rotation", "translation"))
     world_to_reference = reference.axes * OPENCV_SIGNS
     axes = rotation @ world_to_reference * OPENCV_SIGNS
     eye = reference.eye - world_to_reference.T @ rotation.T @ translation
     if camera.has_own_lens:
         return _pinhole_at(camera, scene, Extrinsics(eye, axes, reference.distance))
-    # The reference camera, with the world moved instead of the camera.
-    turn, move = reference.axes.T @ axes, np.eye(4)
-    move[:3, :3], move[:3, 3] = turn, reference.eye - turn @ eye
-    return reference._replace(matrix=reference.matrix @ move, axes=axes, eye=eye)
+    # Keep the optics of the reference camera: move the world instead of the camera.
+    world_rotation, world_motion = reference.axes.T @ axes, np.eye(4)
+    world_motion[:3, :3], world_motion[:3, 3] = world_rotation, reference.eye - world_rotation @ eye
+    return reference._replace(matrix=reference.matrix @ world_motion, axes=axes, eye=eye)
 
 
 def pair_transform(camera: AnyCamera) -> dict[str, Any]:
-    """Return the transform from a camera's reference camera to the camera, as OpenCV's stereoCalibrate.
+    """Return the transform from the reference camera of a camera to the camera, in the convention of stereoCalibrate.
 
     Returns:
         "beside": name of the reference camera; "rotation", 3 x 3, and "translation" [m] with X_this = R X_reference +
@@ -251,7 +253,7 @@ def camera_problems(scene: Scene) -> Iterator[Problem]:
 
 
 def _single_camera_problems(camera: Camera, scene: Scene, name: str) -> Iterator[Problem]:
-    """Yield the problems of a camera, of which only the first is valid; keys are relative to its section."""
+    """Yield the problems of a camera, keys relative to its section; those after the first may be consequences."""
     if camera.beside is None:
         yield from _extrinsics_problems(camera, scene)
     else:
@@ -269,20 +271,20 @@ def _placement_problems(camera: Camera, scene: Scene, name: str) -> Iterator[Pro
         key, distance = "translation", math.hypot(*camera.translation)
     if distance > MAX_BASELINE_RATIO * max(scene.sheet.size):
         message = (
-            f"puts it more than {MAX_BASELINE_RATIO:g} times the size of the sheet away; take a smaller number, "
+            f"moves the camera by more than {MAX_BASELINE_RATIO:g} times the size of the sheet; take a smaller number, "
             "in metres"
         )
         yield Problem((key,), message)
 
 
 def _rotation_fault(rotation: Array) -> str:
-    """Describe the fault of a matrix; empty within 1e-3 of a rotation."""
+    """Describe why a matrix is not a rotation; return "" within 1e-3 of one."""
     deviation = np.abs(rotation @ rotation.T - np.eye(3)).max()
     if deviation <= 1e-3 and np.linalg.det(rotation) > 0:
         return ""
-    fault = f"not a rotation: products of its rows are off by {deviation:.2g}"
+    fault = f"not a rotation: scalar products of its rows are off by {deviation:.2g}"
     if np.linalg.det(rotation) < 0:
-        fault = "a mirror, not a rotation"
+        fault = "a reflection, not a rotation"
     return f"is {fault}; its rows are the directions to the right, down and forward, orthogonal and of length 1"
 
 
@@ -291,15 +293,15 @@ def _pair_problems(scene: Scene) -> Iterator[Problem]:
     cameras = scene.render.all_cameras
     pairs = {name: companion for name in cameras if (companion := scene.render.companion(name))}
     if not pairs:
-        asked = next(name for name in scene.output if OUTPUTS[name].needs_stereo_pair)
-        message = f"{asked} needs a stereo pair; take render.cameras with {{beside: NAME, baseline: metres}}"
+        output_name = next(name for name in scene.output if OUTPUTS[name].needs_stereo_pair)
+        message = f"{output_name} needs a stereo pair; take render.cameras with {{beside: NAME, baseline: metres}}"
         yield Problem(("output",), f"{message}, or leave it out")
     for name, companion in pairs.items() if "disparity" in scene.output else ():
         message = ""
         if view_at(scene, 0.0, name).lens is not None:
-            message = f"disparity is along rows only without distortion, and {name} has one; leave out one of them"
+            message = f"disparity requires cameras without distortion, and {name} has one; leave out one of them"
         elif cameras[companion].baseline is None:  # type: ignore[union-attr]
-            message = f"disparity is along rows only at a baseline, and {companion} has a rotation; take stereo instead"
+            message = f"disparity requires a baseline, and {companion} has a rotation; take stereo instead"
         if message:
             yield Problem(("output",), message)
             return
@@ -307,7 +309,7 @@ def _pair_problems(scene: Scene) -> Iterator[Problem]:
 
 def _extrinsics_problems(camera: Camera, scene: Scene) -> Iterator[Problem]:
     """Yield the problems of a camera's extrinsics at any frame."""
-    place = next((name,) for name in ("eye", "pose", "poses") if getattr(camera, name) is not None)
+    key = next((name,) for name in ("eye", "pose", "poses") if getattr(camera, name) is not None)
     if camera.pose is not None and (fault := _rotation_fault(np.array(camera.pose.rotation))):
         yield Problem(("pose", "rotation"), fault)
     if camera.poses is not None:
@@ -315,19 +317,19 @@ def _extrinsics_problems(camera: Camera, scene: Scene) -> Iterator[Problem]:
         begin, end, duration = camera.poses[0][0], camera.poses[-1][0], scene.time.duration
         tolerance = FRAME_TOLERANCE / scene.time.frames_per_second
         gap = camera.poses[min(1, len(camera.poses) - 1)][0] - max(begin, 0.0)
-        # Such gaps mean that the unit of the times is not the second.
+        # Longer gaps indicate times in another unit than seconds.
         if gap > 1e5 or (len(camera.poses) > 2 and gap > 5 * duration):
             message = f"its first poses are {gap:.6g} s apart, and the scene lasts {duration:g} s"
-            yield Problem(place, f"{message}; set poses_time, the unit of its times: ms, us or ns")
+            yield Problem(key, f"{message}; set poses_time, the unit of its times: ms, us or ns")
         if begin > tolerance or end < duration - tolerance:
             message = f"covers {begin:.12g} s to {end:.12g} s, but the scene goes from 0 s to {duration:g} s"
             remedy = "set poses_start: 0 to begin at the first pose, or another time of the file"
             if begin <= tolerance:
                 remedy = "shorten time.duration or add poses up to its end"
-            yield Problem(place, f"{message}; {remedy}")
+            yield Problem(key, f"{message}; {remedy}")
     if camera.eye is None and extrinsics(camera, 0.0).distance < MIN_MAGNITUDE:
-        message = "puts the eye on the middle of the sheet, which the light's strength depends on; move it away"
-        yield Problem(place, message)
+        message = "puts the eye at the centre of the sheet, so the light has no distance from it; move the eye away"
+        yield Problem(key, message)
     rate = scene.time.frames_per_second
     for time in [frame / rate for frame in range(scene.time.frames + 1)] if camera.moves else [0.0]:
         when = f" at {time:g} s" if camera.moves else ""
@@ -337,19 +339,19 @@ def _extrinsics_problems(camera: Camera, scene: Scene) -> Iterator[Problem]:
             )
             toward = _normalised(np.subtract(eye, target))
             if math.dist(eye, target) < MIN_MAGNITUDE:
-                yield Problem(place, f"{eye} is also the target{when}; move one of them")
+                yield Problem(key, f"{eye} is also the target{when}; move one of them")
             if not np.linalg.norm(np.cross(toward, _normalised(np.array(up)))) > 1e-9:
                 yield Problem(("up",), f"{up} is zero or along the line of sight{when}; take a direction across it")
-        # Kernels multiply the matrix by the samples along a side of a pixel, in f32.
+        # The matrix must be finite in f32, also after kernels scale it by the samples per pixel.
         if np.abs(_pinhole(camera, scene, time).matrix).max() > float(np.finfo(np.float32).max) / MAX_SUPERSAMPLE:
             message = f"is too far away for its focal length{when}; move it nearer"
             if camera.eye is not None and camera.intrinsics is None:
                 message = f"{eye} is too far away for {camera.fov:g} degrees{when}; move it nearer or widen fov"
-            yield Problem(place, message)
+            yield Problem(key, message)
 
 
 def _lens_problems(camera: View) -> Iterator[Problem]:
-    """Yield a problem if the lens distortion folds within the picture."""
+    """Yield a problem if the picture extends beyond the limit of the lens."""
     if camera.lens is None or not np.isnan(camera.undistort(border_points(camera.size))).any():
         return
     fault = "folds back" if camera.lens.limit < MAX_RADIUS else "reaches 88 degrees"
@@ -357,10 +359,10 @@ def _lens_problems(camera: View) -> Iterator[Problem]:
     angle = np.linspace(0, 2 * np.pi, 64)
     circle = np.stack([np.cos(angle), np.sin(angle)], axis=-1)
 
-    def folds(radius: int) -> bool:
+    def is_invalid(radius: int) -> bool:
         return bool(np.isnan(camera.undistort(camera.centre + radius * circle)).any())
 
-    valid_px = max(0, bisect_left(range(corner_px), True, key=folds) - 1)
+    valid_px = max(0, bisect_left(range(corner_px), True, key=is_invalid) - 1)
     message = (
         f"{fault} at {valid_px} px from the principal point, and the picture reaches {corner_px} px; take coefficients"
     )
@@ -368,7 +370,7 @@ def _lens_problems(camera: View) -> Iterator[Problem]:
 
 
 def border_points(size: Array) -> Array:
-    """Return points along the edges of a picture of size (width, height), one per pixel [px], shape (n, 2)."""
+    """Return one point per pixel along the edges of a picture [px], shape (n, 2); `size` is (width, height)."""
     width, height = (int(side) for side in size)
     x, y = np.arange(width + 1.0), np.arange(height + 1.0)
     sides = [(x, 0 * x), (x, 0 * x + height), (0 * y, y), (0 * y + width, y)]
@@ -433,31 +435,31 @@ def _rotation(axis: Array, angle: float) -> Array:
 
 def _top_scale(scene: Scene) -> float:
     """Return the scale at which the sheet at rest fits the picture [px/m]."""
-    (height, width), (columns, lines) = scene.sheet.size, scene.render.size
-    return min(columns / width, lines / height)
+    (height, width), (width_px, height_px) = scene.sheet.size, scene.render.size
+    return min(width_px / width, height_px / height)
 
 
 def _top(scene: Scene) -> View:
-    """Return an orthographic view from above, in which the sheet at rest is centred and fits the picture.
+    """Return the orthographic view from above, with the sheet at rest centred and as large as the picture allows.
 
-    The eye, where depth is 0, is above the sheet by the length of its larger side.
+    The eye (depth 0) is above the sheet, at a height equal to the larger side of the sheet.
     """
-    (columns, lines), scale, distance = scene.render.size, _top_scale(scene), max(scene.sheet.size)
-    rows = [[scale, 0, 0, columns / 2], [0, -scale, 0, lines / 2], [0, 0, 0, 1], [0, 0, -1, distance]]
-    size, eye = np.array([columns, lines], float), np.array([0.0, 0.0, distance])
+    (width_px, height_px), scale, distance = scene.render.size, _top_scale(scene), max(scene.sheet.size)
+    rows = [[scale, 0, 0, width_px / 2], [0, -scale, 0, height_px / 2], [0, 0, 0, 1], [0, 0, -1, distance]]
+    size, eye = np.array([width_px, height_px], float), np.array([0.0, 0.0, distance])
     scales = np.array([scale, scale])
     return View(np.array(rows, dtype=float), 0.0, np.eye(3), eye, scales, size / 2, size, distance, pinhole=False)
 
 
 def _pinhole(camera: Camera, scene: Scene, time: float) -> View:
-    place = extrinsics(camera, time)
-    # The intensity of the light does not change while the camera moves.
-    return _pinhole_at(camera, scene, place._replace(distance=extrinsics(camera, 0.0).distance))
+    placement = extrinsics(camera, time)
+    # The light has its initial intensity while the camera moves, from the initial distance.
+    return _pinhole_at(camera, scene, placement._replace(distance=extrinsics(camera, 0.0).distance))
 
 
-def _pinhole_at(camera: Camera, scene: Scene, place: Extrinsics) -> View:
-    """Return the view of a pinhole camera with some extrinsics."""
-    (columns, lines), (eye, axes, distance) = scene.render.size, place
+def _pinhole_at(camera: Camera, scene: Scene, placement: Extrinsics) -> View:
+    """Return the view of a pinhole camera with other extrinsics than its own."""
+    (width_px, height_px), (eye, axes, distance) = scene.render.size, placement
     right, up, toward = axes
     depth = -toward
     if (intrinsics := camera.intrinsics) is not None:
@@ -465,11 +467,11 @@ def _pinhole_at(camera: Camera, scene: Scene, place: Extrinsics) -> View:
         focal_x, focal_y = camera.focal_lengths
         x, y = intrinsics.cx + 0.5, intrinsics.cy + 0.5
     else:
-        focal_x = focal_y = lines / 2 / np.tan(np.radians(camera.fov) / 2)
-        x, y = columns / 2, lines / 2
+        focal_x = focal_y = height_px / 2 / np.tan(np.radians(camera.fov) / 2)
+        x, y = width_px / 2, height_px / 2
     rows = [focal_x * right + x * depth, -focal_y * up + y * depth, depth, depth]
     matrix = np.array([[*row, -row @ eye] for row in rows])
-    near, size = 1e-6 * math.hypot(*scene.sheet.size), np.array([columns, lines], float)
+    near, size = 1e-6 * math.hypot(*scene.sheet.size), np.array([width_px, height_px], float)
     scale, centre = np.array([focal_x, focal_y]), np.array([x, y])
     lens = Lens(camera.distortion.model, camera.distortion.coefficients) if camera.distortion else IDENTITY_LENS
     lens_or_none = None if lens == IDENTITY_LENS else lens
@@ -481,30 +483,30 @@ def _preset(name: str, scene: Scene) -> Camera:
 
 
 def _fit(scene: Scene) -> Camera:
-    """Return the fit preset, for which the sheet at rest fills the picture up to a margin of 2 %.
+    """Return the fit preset: the sheet at rest fills the picture, except for a margin of 2 %.
 
-    The eye is d from the plane across the line of sight through the sheet's centre. The corners are a above and below
-    that line, and b behind and before the plane. With the eye a b / d below the line, they are projected to a / d above
-    and below the middle of the picture. Before the plane, half the sheet's width has the angle width / 2 / (d - b).
+    In camera axes (up, forward), from the sheet's centre, the upper corners are at (a, b) and the lower ones at (-a,
+    -b). With the eye at (-a b / d, -d) they are projected to the tangents a / d and -a / d, so the sheet is centred.
+    The lower edge is nearest: half its width has the tangent width / 2 / (d - b).
     """
-    (height, width), (columns, lines) = scene.sheet.size, scene.render.size
+    (height, width), (width_px, height_px) = scene.sheet.size, scene.render.size
     axes = _look_at_axes(OBLIQUE_DIRECTION.tolist(), (0, 0, 0), (0, 1, 0))
     a, b = height / 2 * axes[1, 1], -height / 2 * axes[2, 1]
     half_height = (1 - 2 * 0.02) * math.tan(math.radians(OBLIQUE_FOV) / 2)
-    distance = max(a / half_height, width / 2 / (half_height * columns / lines) + b)
+    distance = max(a / half_height, width / 2 / (half_height * width_px / height_px) + b)
     eye = distance * axes[2] - a * b / distance * axes[1]
     target = eye - eye[2] / axes[2, 2] * axes[2]
     return Camera(eye=tuple(eye.tolist()), target=tuple(target.tolist()), fov=OBLIQUE_FOV)
 
 
 def _oblique(scene: Scene) -> Camera:
-    """Return the oblique preset, at a distance where the sheet at rest fits the picture with a margin of 4 %."""
-    (height, width), (columns, lines) = scene.sheet.size, scene.render.size
+    """Return the oblique preset: the sheet at rest fits into the picture, with a margin of 4 % in distance."""
+    (height, width), (width_px, height_px) = scene.sheet.size, scene.render.size
     toward = OBLIQUE_DIRECTION / np.linalg.norm(OBLIQUE_DIRECTION)
     axes = extrinsics(Camera(eye=tuple(toward), fov=OBLIQUE_FOV), 0.0).axes
     corners = np.array([[x, y, 0.0] for x in (-width / 2, width / 2) for y in (-height / 2, height / 2)]) @ axes.T
     half_height = np.tan(np.radians(OBLIQUE_FOV) / 2)
-    half = np.array([half_height * columns / lines, half_height])
+    half = np.array([half_height * width_px / height_px, half_height])
     distance = float((corners[:, 2:] + np.abs(corners[:, :2]) / half).max()) * 1.04
     return Camera(eye=tuple(distance * toward), fov=OBLIQUE_FOV)
 
@@ -514,7 +516,7 @@ class Extrinsics(NamedTuple):
 
     eye: Array  # position [m], shape (3,)
     axes: Array  # unit vectors right, up and toward the camera, as rows, shape (3, 3)
-    distance: float  # of the eye from the target, for a pose from the centre of the sheet at rest [m]
+    distance: float  # from the eye to the target, for a pose to the centre of the sheet at rest [m]
 
 
 def extrinsics(camera: Camera, time: float) -> Extrinsics:
@@ -538,7 +540,7 @@ def extrinsics(camera: Camera, time: float) -> Extrinsics:
 
 
 def _look_at_axes(eye: Sequence[float], target: Sequence[float], up: Sequence[float]) -> Array:
-    """Return the axes of a camera, as rows, from its eye and target [m]; `up` has any length, and appears vertical."""
+    """Return the axes of a camera, as rows; `up`, of any length, is vertical in the picture."""
     toward = _normalised(np.subtract(eye, target))
     right = _normalised(np.cross(_rescaled(np.array(up)), toward))
     return np.stack([right, np.cross(toward, right), toward])
@@ -551,7 +553,7 @@ def _normalised(vector: Array) -> Array:
 
 
 def _rescaled(vector: Array) -> Array:
-    """Scale a vector by a power of 2, which is exact, so that its squares neither overflow nor underflow."""
+    """Scale a vector by a power of 2, without rounding, so that its squares neither overflow nor underflow."""
     return np.ldexp(vector, -math.frexp(float(np.abs(vector).max()))[1])
 
 
@@ -562,7 +564,7 @@ def _nearest_rotation(matrix: Array) -> Array:
 
 
 def _interpolate_keyframes(value: Sequence[float] | Sequence[Sequence[float]], time: float) -> Sequence[float]:
-    """Interpolate keyframes (time [s], x, y, z) of a vector linearly, constant outside of them; or return a vector."""
+    """Return a vector at a time: itself, or linear interpolation of keyframes (time [s], x, y, z), constant beyond."""
     keys = np.array(value)
     if keys.ndim == 1:
         return value  # type: ignore[return-value]

@@ -1,9 +1,9 @@
 """Compile-time configuration and G-buffer layout of the rasteriser (kernel 2).
 
 A sample is a pixel, or with supersampling one of several per pixel. The samples of a tile form a vector: 4 x 4 samples
-for the 16 lanes of AVX-512, 4 x 2 for 8 lanes, 4 x 1 for 4 lanes, and a single sample on a GPU. The G-buffer has
-several vectors per tile, its planes. On a CPU a band of rows of tiles is the unit of parallel work, and each worker has
-memory for one band.
+for the 16 lanes of AVX-512, 4 x 2 for 8 lanes, 4 x 1 for 4 lanes, and a single sample on a GPU. The planes of the
+G-buffer (depth, normals, ...) have one vector per tile each. On a CPU the unit of parallel work is a band, some rows of
+tiles, and each worker has the G-buffer of one band.
 
 Names that the functions of kernel 2 share:
 
@@ -14,13 +14,13 @@ Names that the functions of kernel 2 share:
     i, j                  row and column of a mass point or a cell
     nodes                 projected mass points, as stored by `project`
     corner                first entry of a cell's upper left mass point in `nodes`
-    distorted_entry       the same after lens distortion, as stored by `store_distorted`
+    distorted_entry       first entry of its distorted position in `nodes`, as stored by `store_distorted`
     near, depth           near plane [m]; depth [m]
     facing                1 if the front of a cell is visible, -1 for its back
     quad_column, quad_row column and row of sub-quads in their cell
     quad_side             side of the sub-quads, as a fraction of the cell's
-    lower                 whether the triangle is the one below the diagonal, in a cell that is not invertible
-    enlargement           fraction of its side by which that triangle is enlarged
+    lower                 whether a triangle is below the diagonal of its sub-quad; for cells that are not invertible
+    enlargement           enlargement of such a triangle, as a fraction of its side
     s, t                  coordinates on a triangle, to the right and down
     across, along         coordinates in a cell, to the right and down, from 0 to 1
     normal                list of three components, of any length
@@ -71,10 +71,10 @@ class DrawingConfig(NamedTuple):
     relief: bool  # whether tissue is shaded with a relief
     vignette: bool  # whether tissue is shaded with a vignette
     wireframe: bool  # whether the mass-point mesh is drawn
-    shapes: tuple[str, ...]  # of the instruments
+    shapes: tuple[str, ...]  # names of the shapes of the instruments
     metal: bool  # whether instruments are shaded
     picture: bool  # whether colours are written
-    labels: frozenset[str]  # that are written; they require one sample per pixel
+    labels: frozenset[str]  # names of the labels that are written; they require one sample per pixel
     lens: str  # name of the lens model; empty without lens distortion
     lanes: int  # samples in a tile
 
@@ -90,7 +90,7 @@ class DrawingConfig(NamedTuple):
 
     @property
     def unordered(self) -> bool:
-        """Whether the cells at a sample are processed in arbitrary order, as on a GPU, instead of row by row."""
+        """Whether the order of the cells at a sample is arbitrary, as on a GPU; otherwise it is row by row."""
         return self.lanes == 1
 
     @property
@@ -112,7 +112,7 @@ class DrawingConfig(NamedTuple):
     def map_planes(self) -> int:
         """Vectors per tile of the undistortion map; 0 without lens distortion.
 
-        They are x and y, the steps to the next samples (`undistortion_map`), and on a CPU the bounding box.
+        They are x and y; with `map_has_steps` four steps; on a CPU the bounding box of the tile.
         """
         return (6 if self.map_has_steps else 2) + (not self.unordered) if self.lens else 0
 
@@ -123,7 +123,7 @@ class DrawingConfig(NamedTuple):
 
     @property
     def band_rows(self) -> int:
-        """Rows of pixels in a band on a CPU: those of 16 rows of samples, at least one."""
+        """Rows of pixels in a band on a CPU, for 16 rows of samples; at least one."""
         return max(1, 16 // self.supersample)
 
     @property
@@ -170,7 +170,7 @@ def _planes(config: DrawingConfig) -> Any:
 
 
 class Band(NamedTuple):
-    """Arguments of a kernel, and a band of the picture or a part of one; lengths are in samples."""
+    """Arguments of a kernel, and a rectangle of the picture [samples]: a band, or a part of it on a GPU."""
 
     config: DrawingConfig
     uniforms: Any  # constants of the view (uniforms.py)
@@ -285,8 +285,8 @@ def tile_range(first_column, end_column, first_row, end_row, band: ti.template()
         band: band, whose edges are `left`, `right`, `top` and `bottom`.
 
     Returns:
-        First column of tiles, column after the last one; first row of tiles from the band's top, row after the last
-        one.
+        First column of tiles, column after the last one; first row of tiles, counted from the band's top, row after the
+        last one.
     """
     tile_width, tile_height = ti.static((band.config.tile_width, band.config.tile_height))
     return (
@@ -322,7 +322,7 @@ def _map_entry(entry, band: ti.template()):
 def undistorted_centres(left, top, entry, band: ti.template()):
     """Return the undistorted x and y of the sample centres of a tile [samples], one per lane.
 
-    INVALID_COORDINATE beyond the limit of the lens.
+    They are INVALID_COORDINATE beyond the limit of the lens.
 
     Args:
         left: first column of the tile [samples].
@@ -362,7 +362,7 @@ def tile_box(entry, left, top, band: ti.template()):
 
 @ti.func
 def map_steps(entry, band: ti.template()):
-    """Return the undistorted steps between samples: x and y to the right, x and y downward [samples], one per lane.
+    """Return the undistorted steps to the next samples [samples]: x and y of the right one, x and y of the lower one.
 
     Args:
         entry: first entry of the tile in the G-buffer.

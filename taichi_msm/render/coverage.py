@@ -1,11 +1,14 @@
 """Coverage: the nearest surface at every sample, of the sheet and of the instruments.
 
-Vertices are not stored. For a sample inside the outline of a cell, the two equations of geometry.py yield the sub-quad,
-the side of the sub-quad's diagonal the triangle, and the two linear equations of the triangle the point on it. A cell
-that is folded or extends behind the camera is drawn triangle by triangle instead.
+The refined surface is not stored. For a sample inside the outline of a cell:
 
-The line of sight through a sample is P = O + D t, where t is the depth. `taichi_msm.shapes` intersects it with the
-instruments.
+1. Solve the two equations of geometry.py for the sub-quad.
+2. Choose its triangle by the side of the diagonal.
+3. Solve two linear equations for the point on the triangle.
+
+A cell that is folded or extends behind the camera is drawn triangle by triangle.
+
+`taichi_msm.shapes` intersects the instruments with the line of sight through a sample, P = O + D t at depth t.
 
 To add an output per pixel, add its planes in labels.py or config.py and its values in `_store_surface`.
 """
@@ -56,7 +59,7 @@ class Cell(NamedTuple):
 
 @ti.func
 def _max_edge(p_x, p_y, q_x, q_y, box: ti.template(), facing):
-    """Return the maximum of `geometry.edge` over the samples within a box; rounded alike, so that none is skipped."""
+    """Return the maximum of `geometry.edge` over the samples within a box, rounded as at the samples themselves."""
     left, right, top, bottom = ti.static(box)
     x = ti.select((q_y - p_y) * facing > 0.0, left, right)
     y = ti.select((q_x - p_x) * facing > 0.0, bottom, top)
@@ -92,7 +95,7 @@ def _cover_tile(
     depth = geometry.depth_at(s, t, triangle)
     visible = inside & (depth < band.samples[entry + plane.depth])
     if ti.static(config.unordered):
-        # At equal depth the first cell and triangle are visible, whatever the order of processing.
+        # At equal depth the first cell and triangle win, in any order of processing.
         cell_index = cell.i * cell.cols + cell.j
         piece = (quad_row * band.subdivisions + quad_column) * 2.0 + ti.select(triangle.below, 0.0, 1.0)
         stored_cell, stored_piece = band.samples[entry + plane.cell], band.samples[entry + plane.triangle]
@@ -112,8 +115,8 @@ def cover_cell(i, j, invertible, first, end, outline: ti.template(), band: ti.te
         i: row of the cell.
         j: column of the cell.
         invertible: whether the cell is drawn by inverting its bilinear map, instead of triangle by triangle.
-        first: first piece of the cell: 0, or its first triangle.
-        end: piece after the last one: 1, or the triangle after the last one.
+        first: first triangle that is drawn; 0 if the cell is inverted.
+        end: triangle after the last one; 1 if the cell is inverted.
         outline: projected corners of the cell.
         band: the band, whose G-buffer is updated.
     """
@@ -145,8 +148,8 @@ def cover_cell(i, j, invertible, first, end, outline: ti.template(), band: ti.te
         )
         tiles = ti.max(end_tile_row - first_tile_row, 0) * ti.max(end_tile - first_tile, 0)
         tile, tile_row = first_tile, first_tile_row
-        # A tile is covered after the sub-quads of the next one are computed: the two are independent, so the processor
-        # overlaps them. `pending` is the entry of the tile that is still to be covered, or -1.
+        # Software pipelining: compute the sub-quads of a tile, then cover the previous tile. The processor overlaps the
+        # two, as they are independent. `pending` is the entry of the previous tile, or -1.
         pending = -1
         pending_x, pending_y, pending_inside = float_vector(0), float_vector(0), float_vector(0)
         pending_column, pending_row = float_vector(0), float_vector(0)
@@ -171,7 +174,7 @@ def cover_cell(i, j, invertible, first, end, outline: ti.template(), band: ti.te
                         if ti.static(config.refined):
                             quad_column, quad_row = geometry.find_quads(x, y, inside, band.subdivisions, patch)
                 else:
-                    # Outside the bounds, rounding would cover samples that depend on the shape of the tiles.
+                    # Only within the bounds: beyond them rounding may cover samples, depending on the tile shape.
                     sample_x, sample_y = sample_centres(tile_x, tile_y, config)
                     inside = (
                         (sample_x > ti.cast(first_column, ti.f32))
@@ -214,13 +217,12 @@ def intersect_instrument(x, y, index, uniforms: ti.template(), shapes: ti.templa
         shapes: names of the shapes of all instruments.
 
     Returns:
-        Depth of the first intersection [m], INFINITY without one; three components of its outward normal, in the
-        camera's
-        frame and of any length.
+        Depth of the first intersection [m], INFINITY without one; three components of its outward normal in the
+        camera's frame, of any length.
     """
     base = uni.INSTRUMENTS + index * uni.INSTRUMENT_STRIDE
     tip, axis = base + uni.TIP, base + uni.AXIS
-    # The line of sight is P = O + D t, with t relative to the depth of the tip and the origin at the tip.
+    # The line of sight is P = O + D t from the tip: t is the depth beyond that of the tip.
     start = uniforms[tip + 2] * (-1.0)
     across, up = geometry.line_of_sight(x, y, uniforms)
     w = geometry.w_at(start, uniforms)
@@ -274,7 +276,7 @@ def cover_instruments(band: ti.template()):
         top, bottom = uniforms[base + uni.TOP], uniforms[base + uni.BOTTOM]
         low_x, high_x, low_y, high_y = left, right, top, bottom
         if ti.static(config.has_distortion):
-            # With lens distortion each tile has its own undistorted box.
+            # Each tile is tested below, by its undistorted box.
             low_x, high_x, low_y, high_y = band.left, band.right, band.top, band.bottom
         if low_y < band.bottom and high_y > band.top:
             first_column, end_column, first_row, end_row = clip(low_x, high_x, low_y, high_y, band)
@@ -299,7 +301,7 @@ def _cell_at(i, j, normal_entry, patch: ti.template(), band: ti.template()):
     """Return the `Cell` with a mass point as its upper left corner."""
     rows, cols = band.rows - 1, band.cols - 1
     texture_width, texture_height = band.sizes[uni.LEVELS + 1], band.sizes[uni.LEVELS + 2]
-    # In f64, for the accuracy of a fraction of a texel on any sheet.
+    # In f64, for an accurate fraction of a texel with any number of cells and texels.
     texel_x = ti.cast(j, ti.f64) * texture_width / cols - 0.5
     texel_y = ti.cast(i, ti.f64) * texture_height / rows - 0.5
     whole_x, whole_y = ti.floor(texel_x), ti.floor(texel_y)
@@ -318,9 +320,9 @@ def _cell_at(i, j, normal_entry, patch: ti.template(), band: ti.template()):
 
 @ti.func
 def store_point(position: ti.template(), i, j, band: ti.template()):
-    """Project a mass point; if the configuration needs them, also distort it and compute its normal.
+    """Store the projection of a mass point, and as configured its distorted position and its normal.
 
-    The normal is in camera axes with tissue, otherwise in those of the world.
+    The normal is in the camera's frame for tissue, and in the world's for the headlight.
 
     Args:
         position: positions of the mass points [m], shape (rows, cols, 3).
@@ -368,17 +370,17 @@ def _absolute(values):
 def _headlight(normal: ti.template(), uniforms: ti.template()):
     """Return the reflected share of the headlight: the absolute cosine between normal and direction to the light."""
     cosine = _absolute(dot(normal, triple(uniforms, uni.HEADLIGHT))) / ti.max(ti.sqrt(dot(normal, normal)), 1e-30)
-    # The normal of an infinite or NaN point is NaN; the limits remove it.
+    # Infinite or NaN mass points have NaN normals, which these limits replace.
     return ti.max(ti.min(cosine, 1.0), 0.0)
 
 
 @ti.func
 def _footprint(entry, x, y, s, t, texels_x, texels_y, triangle: ti.template(), band: ti.template()):
-    """Return the squared size of samples on the texture in `uniforms.FULL_RESOLUTION_TEXELS`, and the visible side.
+    """Return the squared size of samples on the texture, in units of FULL_RESOLUTION_TEXELS, and the visible side.
 
-    With x = X / w the Jacobian of (x, y) with respect to (s, t) is (R_1, D_1; R_2, D_2) / w, where R_1 = R_x - x R_w
-    and so on; that of (s, t) with respect to (x, y) is its inverse. The size is the larger of width and height; the
-    side is 1 for the front of the triangle, else -1. The sub-quad is `texels_x` wide and `texels_y` high [texels].
+    From x = X / w the Jacobian of (x, y) with respect to (s, t) is (R_1, D_1; R_2, D_2) / w, with R_1 = R_x - x R_w and
+    so on. Its inverse maps a sample to the triangle, and `texels_x` and `texels_y`, the sides of the sub-quad [texels],
+    to the texture. The size is the larger of width and height; the side is 1 for the front of the triangle, else -1.
     """
     p, r, d = ti.static((triangle.p, triangle.r, triangle.d))
     r_1 = r[0] - x * r[2]
@@ -395,7 +397,7 @@ def _footprint(entry, x, y, s, t, texels_x, texels_y, triangle: ti.template(), b
     across_1, across_2, down_1, down_2 = d_1 * texels_x, d_2 * texels_x, r_1 * texels_y, r_2 * texels_y
     largest = ti.max(across_1 * across_1 + down_1 * down_1, across_2 * across_2 + down_2 * down_2)
     square = largest * (scale * scale) * (1.0 / (uni.FULL_RESOLUTION_TEXELS * uni.FULL_RESOLUTION_TEXELS))
-    # The limit is above the footprint on any texture.
+    # 1e12 exceeds the squared size on any texture.
     return ti.min(square, 1e12), ti.select(scale < 0.0, -1.0, 1.0)
 
 
@@ -403,7 +405,7 @@ def _footprint(entry, x, y, s, t, texels_x, texels_y, triangle: ti.template(), b
 def _distance_to_line(coordinate, right_coordinate, lower_coordinate):
     """Return the distance of samples from the nearest mesh line [samples].
 
-    The coordinates across the lines [cells] are those of the samples and of the next ones on the right and below.
+    The coordinates [cells] run across the lines: at the samples, at the next samples on the right, and below.
     """
     step_right, step_down = right_coordinate - coordinate, lower_coordinate - coordinate
     slope = ti.sqrt(step_right * step_right + step_down * step_down)
@@ -432,14 +434,14 @@ def _store_surface(
         normal = _normal_at(across, along, cell, band)
         store_visible(entry + plane.light, visible, _headlight(normal, band.uniforms), samples)
     if ti.static(config.tissue):
-        size, front = _footprint(
+        size, side = _footprint(
             entry, x, y, s, t, cell.texels_across * quad_side, cell.texels_down * quad_side, triangle, band
         )
-        # At a fold, the interpolated normal may point away from the camera; `front` moves it to the visible side.
+        # At a fold the interpolated normal may point away from the camera; `side` flips it.
         normal = _normal_at(across, along, cell, band)
-        store_visible(entry + plane.normal_x, visible, normal[0] * front, samples)
-        store_visible(entry + plane.normal_y, visible, normal[1] * front, samples)
-        store_visible(entry + plane.normal_z, visible, normal[2] * front, samples)
+        store_visible(entry + plane.normal_x, visible, normal[0] * side, samples)
+        store_visible(entry + plane.normal_y, visible, normal[1] * side, samples)
+        store_visible(entry + plane.normal_z, visible, normal[2] * side, samples)
         store_visible(entry + plane.footprint, visible, size, samples)
     if ti.static(config.wireframe):
         right_x, right_y, below_x, below_y = x + 1.0, y, x, y + 1.0

@@ -39,10 +39,10 @@ class Bands:
         (rows, cols), (width, height) = shape, size
         self._workers = min(-(-height // config.band_rows), runtime.current_device().threads)
         self._memory = memory = runtime.Memory()
-        # After the numbers of the mass points, two per row: the first and last row of the picture without distortion.
+        # Projected mass points; then for each row of them the first and last undistorted row of the picture.
         self._nodes = memory.array("f32", 0, rows * (cols * geometry.POINT_STRIDE + 2))
         tiles_of_band = config.band_lines * config.tiles_across(width)
-        # With lens distortion the undistortion map comes before the bands; after each of its bands their bounds.
+        # With lens distortion the undistortion map, each of its bands followed by its bounds; then a band per worker.
         map_vectors = -(-height // config.band_rows) * (tiles_of_band * config.map_planes + config.has_distortion)
         self._samples = memory.array("f32", config.lanes, map_vectors + self._workers * tiles_of_band * config.planes)
 
@@ -106,7 +106,7 @@ def _tiled_map(table: NDArray[np.float32], config: DrawingConfig) -> NDArray[np.
 
 @ti.func
 def _project_row(position: ti.template(), i, band: ti.template()):
-    """Project a row of mass points, and store the first and last row of the picture that it overlaps."""
+    """Project a row of mass points, and store the first and last undistorted row of the picture that it overlaps."""
     cols, nodes = ti.static((band.cols, band.nodes))
     first_row, last_row = INFINITY, -INFINITY
     for j in range(cols):
@@ -197,7 +197,7 @@ def _kernel(config: DrawingConfig) -> Callable[..., None]:
         for index in range(workers * ITERATIONS_PER_THREAD):
             if index % ITERATIONS_PER_THREAD == 0:
                 picture = ti.static(read_arguments(uniforms, sizes, nodes, samples, config))
-                # Starting a separate parallel loop takes longer than projecting a sheet of usual size.
+                # In the same loop: starting another parallel loop takes longer than projecting a sheet of usual size.
                 _project_all(position, picture)
                 height = sizes[uni.HEIGHT]
                 tiles_of_band = picture.tiles_across * config.band_lines

@@ -1,8 +1,8 @@
 """Projected mass points, cells and triangles, for one sample or a vector of samples, in f32 or f64.
 
-A point of the surface is represented by (X, Y, w, depth), the product of the camera's matrix and the point. This map is
-linear, so projected cells can be subdivided like the surface, also in perspective. With s to the right and t down, the
-surface between the four mass points of a cell is
+A point of the surface is represented by (X, Y, w, depth), the product of the camera's matrix and the point. The map is
+linear, so subdividing a projected cell is exact, also in perspective. With s to the right and t down, the surface
+between the four mass points of a cell is
 
     P(s, t) = A + B s + C t + D s t,    projected to sample (x, y) where    X - x w = 0,  Y - y w = 0.
 
@@ -17,17 +17,17 @@ from taichi_msm.render import uniforms as uni
 from taichi_msm.render.config import INFINITY, cross
 from taichi_msm.system.runtime import ti
 
-# Numbers per mass point: X, Y, w, depth, and at SCREEN its x and y in the picture [samples]. In kernel 2, `nodes` holds
-# the normals after them, and then the distorted mass points.
+# Numbers per mass point: X, Y, w, depth, and from SCREEN on its x and y in the picture [samples]. In kernel 2, `nodes`
+# has three blocks: these numbers, the normals, the distorted positions.
 SCREEN, NODE_STRIDE, NORMAL_STRIDE, DISTORTED_STRIDE = uni.SCREEN, 6, 3, lens_kernels.DISTORTED_STRIDE
 POINT_STRIDE = NODE_STRIDE + NORMAL_STRIDE + DISTORTED_STRIDE
 
-# Triangles of cells that are not inverted are enlarged to close gaps between them: by this fraction of their side, and
-# by this fraction of the picture's side, the resolution of f32.
+# Enlargement that closes gaps between triangles drawn one by one: a fraction of their side, plus a fraction of the
+# picture's side, the resolution of f32.
 ENLARGEMENT = 1e-5
 SCREEN_ENLARGEMENT = 2e-6
 
-# Limit of the corners' coordinates up to which the bilinear map of a cell is inverted in f32 [samples].
+# Largest coordinate of a corner with which the bilinear map of a cell is invertible in f32 [samples].
 MAX_COORDINATE = float(1 << 16)
 
 
@@ -41,8 +41,8 @@ class Outline(NamedTuple):
     top: Any
     bottom: Any
     facing: Any  # 1 if the front is visible, -1 for the back, 0 if the cell is folded
-    in_front: Any  # whether all corners are in front of the near plane
-    behind: Any  # whether all corners are behind it
+    in_front: Any  # whether all corners are beyond the near plane, in front of the camera
+    behind: Any  # whether no corner is
 
 
 class Patch(NamedTuple):
@@ -206,9 +206,9 @@ def cell_patch(corner, cols, facing, invertible, nodes: ti.template(), double: t
 
 @ti.func
 def edge(p_x, p_y, q_x, q_y, x, y, facing):
-    """Return twice the signed area of the triangle p, q, (x, y), whose sign is the side of the line p q.
+    """Return twice the signed area of the triangle p, q, (x, y); its sign tells the side of the line p q.
 
-    Both cells at an edge compute the same bits except for the sign.
+    The two cells at an edge compute the same bits, up to the sign.
 
     Args:
         p_x: column of the line's first point [samples].
@@ -225,7 +225,7 @@ def edge(p_x, p_y, q_x, q_y, x, y, facing):
 
 @ti.func
 def edges(x, y, facing, outline: ti.template()):
-    """Return `edge` for the left, right, upper and lower edge of a cell; none is negative inside the cell.
+    """Return `edge` of the left, right, upper and lower edge of a cell; inside the cell all are 0 or more.
 
     Args:
         x: undistorted columns [samples].
@@ -244,7 +244,7 @@ def edges(x, y, facing, outline: ti.template()):
 
 @ti.func
 def _facing_of(x: ti.template(), y: ti.template()):
-    """Return `facing` of a cell from lists of its corners' x and y; 0 if it is folded and both sides are visible."""
+    """Return `facing` of a cell from lists of its corners' x and y; 0 if it is folded."""
     # Twice the signed areas of the triangles of three corners, positive if clockwise in the picture.
     turns = [
         (x[m] - x[n]) * (y[k] - y[m]) - (y[m] - y[n]) * (x[k] - x[m])
@@ -255,7 +255,7 @@ def _facing_of(x: ti.template(), y: ti.template()):
 
 @ti.func
 def find_quads(x, y, inside, subdivisions, patch: ti.template()):
-    """Invert the bilinear map: return column and row of the sub-quads at samples.
+    """Invert the bilinear map of a cell at samples: return the column and the row of their sub-quads.
 
     Args:
         x: undistorted columns [samples].
@@ -340,7 +340,7 @@ def is_within(s, t, enlargement, near, triangle: ti.template()):
     Args:
         s: coordinate on the triangle, to the right.
         t: coordinate on the triangle, down.
-        enlargement: enlargement of the triangle, as a fraction of its side.
+        enlargement: width of the margin around the triangle, as a fraction of its side.
         near: near plane [m].
         triangle: drawn triangle of a sub-quad.
     """
@@ -438,8 +438,8 @@ def distorted_cell_bounds(distorted_entry, cols, outline: ti.template(), uniform
 def is_off_screen(corners: ti.template(), left, right, top, bottom):
     """Return whether a polygon, possibly partly behind the camera, is beyond an edge of the picture.
 
-    For an edge x of the picture, X = x w is a plane that extends behind the camera; points beyond it have a larger X,
-    or a smaller one at the left edge.
+    The right edge x of the picture is the plane X = x w, which also extends behind the camera. The polygon is beyond it
+    if X > x w at all corners; the other edges are alike.
 
     Args:
         corners: list of the corners, vectors (X, Y, w, ...).
@@ -477,9 +477,8 @@ def triangle_bounds(
         lens: name of the lens model; empty without lens distortion.
 
     Returns:
-        Least and largest x, least and largest y [samples], where the largest is below the least if the triangle is
-        outside
-        the picture; and the enlargement, as a fraction of the triangle's side, that closes gaps.
+        Least and largest x, least and largest y [samples], the largest below the least for a triangle outside the
+        picture; and the enlargement that closes gaps, as a fraction of the triangle's side.
     """
     a, b, c, d = ti.static((patch.a, patch.b, patch.c, patch.d))
     low_x, high_x, low_y, high_y = 0.0, ti.cast(width, ti.f32), -INFINITY, INFINITY

@@ -1,9 +1,9 @@
 """Kernel 2 on a GPU: every mass point, cell, sample and pixel is a thread.
 
-A part is a cell, or some triangles of a cell that is drawn triangle by triangle. Parts are listed in bins (bins.py).
-Each sample processes the list of its bin, in several launches if necessary to bound the time of a thread; the nearest
-surface is kept between launches. Then each pixel covers its samples with the instruments and shades them. The picture
-is drawn in strips of rows, with a thread per sample.
+A cell is one piece, or one piece per triangle if it is drawn triangle by triangle. A part is some consecutive pieces of
+a cell. Parts are listed in bins (bins.py), and each sample processes the list of its bin, in chunks that bound the time
+of a thread; the nearest surface is kept between launches. Then each pixel covers its samples with the instruments and
+shades them. The picture is drawn in strips of rows, with a thread per sample.
 """
 
 from collections.abc import Callable
@@ -50,11 +50,11 @@ class Threads:
         self._cells = (rows - 1) * (cols - 1)
         samples_across = width * config.supersample
         # Rows of pixels in a strip.
-        self._rows = min(max(1, VULKAN_THREADS // (samples_across * config.supersample)), height)
+        self._strip_rows = min(max(1, VULKAN_THREADS // (samples_across * config.supersample)), height)
         self._texels = launches.upload(texels)
         self._nodes = launches.array(np.float32, rows * cols * geometry.POINT_STRIDE)
         self._pieces = launches.array(np.int32, self._cells)
-        strip = self._rows * config.supersample * samples_across * config.planes
+        strip = self._strip_rows * config.supersample * samples_across * config.planes
         # With lens distortion the undistortion map comes before the strip.
         self._samples = ti.ndarray(
             config.float_vector, height * config.supersample * samples_across * config.map_planes + strip
@@ -85,9 +85,9 @@ class Threads:
         launches, factor = Launches(bounded=True), self._config.supersample
         (width, height), instruments = self._size, int(sizes[uni.INSTRUMENT_COUNT])
         samples_across, samples_down = width * factor, height * factor
-        view = launches.upload(uniforms), launches.upload(sizes)
+        view_arrays = launches.upload(uniforms), launches.upload(sizes)
         with compilation_options(optimised=False):
-            self._project(position, *view, self._nodes, self._pieces)
+            self._project(position, *view_arrays, self._nodes, self._pieces)
         pieces = launches.download(self._pieces)
         pieces_per_part = max(1, min(-(-int(pieces.sum(dtype=np.int64)) // MAX_PARTS), int(pieces.max())))
         # A cell behind the eye is one empty part.
@@ -95,32 +95,32 @@ class Threads:
         parts = int(ends[-1])
         owners, bounds = launches.array(np.int32, 2 * parts), launches.array(np.int32, BOUNDS_STRIDE * parts)
         launches.launch(
-            self._bound, parts, pieces_per_part, *view, launches.upload(ends), self._nodes, self._pieces,
+            self._bound, parts, pieces_per_part, *view_arrays, launches.upload(ends), self._nodes, self._pieces,
             owners, bounds,
             rounds=SEARCH_ROUNDS + pieces_per_part,
         )  # fmt: skip
         bin_size = max(8, round((samples_across * samples_down / self._cells) ** 0.5))
         bins = build_bins(launches, bounds, parts, (samples_across, samples_down), bin_size)
         sizes[[uni.BIN_SIZE, uni.BINS_ACROSS]] = bins.size, bins.columns
-        view = view[0], launches.upload(sizes)
+        view_arrays = view_arrays[0], launches.upload(sizes)
         # Iterations per sample: one per part, and three per triangle, for the triangle and its tiles.
         rounds_of_part = 1 + 3 * pieces_per_part
         rounds_of_instruments = instruments * (1 + factor * (1 + factor))
         rounds_of_shading = factor * (1 + factor * (1 + int(sizes[uni.LEVEL_COUNT]) + instruments)) + 2
-        for row in range(0, height, self._rows):
-            rows = min(self._rows, height - row)
+        for row in range(0, height, self._strip_rows):
+            rows = min(self._strip_rows, height - row)
             top, bottom = row * factor, (row + rows) * factor
             longest = int(bins.lengths[top // bins.size : (bottom - 1) // bins.size + 1].max())
-            for listed, count in launches.chunks(longest, rounds_of_part):
+            for chunk_start, chunk_size in launches.chunks(longest, rounds_of_part):
                 launches.launch(
                     self._cover, rows * factor * samples_across,
-                    top, listed, count, pieces_per_part, *view, self._nodes, self._pieces, owners, bounds,
-                    bins.starts, bins.entries, self._samples,
-                    rounds=count * rounds_of_part,
+                    top, chunk_start, chunk_size, pieces_per_part, *view_arrays, self._nodes, self._pieces, owners,
+                    bounds, bins.starts, bins.entries, self._samples,
+                    rounds=chunk_size * rounds_of_part,
                 )  # fmt: skip
             launches.launch(
                 self._resolve, rows * width,
-                row, *view, self._texels, self._samples, self._colours, self._labels,
+                row, *view_arrays, self._texels, self._samples, self._colours, self._labels,
                 rounds=rounds_of_instruments + rounds_of_shading,
             )  # fmt: skip
         launches.require_completion()
@@ -139,7 +139,7 @@ def _sheet_kernels(config: DrawingConfig) -> tuple[Callable[..., None], Callable
     ):  # fmt: skip
         """Project the mass points, and count the pieces of each cell.
 
-        A cell has 1 piece if its bilinear map is inverted, otherwise one per triangle, and 0 behind the eye.
+        A cell has one piece if it is inverted, one per triangle if not, and none behind the eye.
 
         Args:
             position: positions of the mass points [m], shape (rows, cols, 3).
@@ -223,7 +223,7 @@ def _picture_kernels(config: DrawingConfig) -> tuple[Callable[..., None], Callab
     factor = config.supersample
 
     @ti.func
-    def place(x, y, across, strip_row, picture: ti.template()):
+    def band_of(x, y, across, strip_row, picture: ti.template()):
         """Return the band of `across` x `across` samples at column x and row y, in a strip from `strip_row` on."""
         samples_of_map = picture.width * picture.height * config.map_planes
         first = samples_of_map + (y - strip_row) * picture.width * config.planes
@@ -233,7 +233,7 @@ def _picture_kernels(config: DrawingConfig) -> tuple[Callable[..., None], Callab
 
     @ti.kernel
     def cover_samples(
-        first: ti.i32, end: ti.i32, ended: Integers, top: ti.i32, listed: ti.i32, count: ti.i32,
+        first: ti.i32, end: ti.i32, ended: Integers, top: ti.i32, chunk_start: ti.i32, chunk_size: ti.i32,
         pieces_per_part: ti.i32, uniforms: Floats, sizes: Integers, nodes: Floats, pieces: Integers, owners: Integers,
         bounds: Integers, starts: Integers, entries: Integers,
         samples: ti.types.ndarray(dtype=config.float_vector, ndim=1),
@@ -245,8 +245,8 @@ def _picture_kernels(config: DrawingConfig) -> tuple[Callable[..., None], Callab
             end: sample after the last one.
             ended: counter of finished threads, for `end_thread`.
             top: first row of samples of the strip.
-            listed: position of the first part in its list; with 0 the samples are cleared first.
-            count: number of parts.
+            chunk_start: position of the first part of the chunk in each list; at 0 the samples are cleared.
+            chunk_size: number of parts.
             pieces_per_part: maximum number of pieces in a part.
             uniforms: constants of the view, as returned by `view_uniforms`.
             sizes: sizes and counters, as returned by `sizes_of`.
@@ -261,12 +261,12 @@ def _picture_kernels(config: DrawingConfig) -> tuple[Callable[..., None], Callab
         for index in range(first, end):
             picture = ti.static(read_arguments(uniforms, sizes, nodes, samples, config))
             x, y = index % picture.width, top + index // picture.width
-            band = ti.static(place(x, y, 1, top, picture))
-            if listed == 0:
+            band = ti.static(band_of(x, y, 1, top, picture))
+            if chunk_start == 0:
                 clear_tile(band.first + x * config.planes, band)
             bin_index = y // sizes[uni.BIN_SIZE] * sizes[uni.BINS_ACROSS] + x // sizes[uni.BIN_SIZE]
-            begin = starts[bin_index] + listed
-            for n in range(begin, ti.min(begin + count, starts[bin_index + 1])):
+            begin = starts[bin_index] + chunk_start
+            for n in range(begin, ti.min(begin + chunk_size, starts[bin_index + 1])):
                 if is_in_bounds(entries[n], x, y, bounds):
                     cell, piece = owners[2 * entries[n]], owners[2 * entries[n] + 1]
                     end_piece = ti.min(piece + pieces_per_part, pieces[cell])
@@ -298,7 +298,7 @@ def _picture_kernels(config: DrawingConfig) -> tuple[Callable[..., None], Callab
         for index in range(first, end):
             picture = ti.static(read_arguments(uniforms, sizes, (), samples, config))
             x, y = index % sizes[uni.WIDTH], row + index // sizes[uni.WIDTH]
-            band = ti.static(place(x * factor, y * factor, factor, row * factor, picture))
+            band = ti.static(band_of(x * factor, y * factor, factor, row * factor, picture))
             if ti.static(len(config.shapes) > 0):
                 cover_instruments(band)
             resolve(y, y + 1, x, x + 1, texels, colours, labels, band)

@@ -41,7 +41,7 @@ class Label(NamedTuple):
     missing_value: float  # in pixels without a visible surface
     sheet_only: bool  # whether pixels of instruments also have the missing value
     dtype: type[np.generic]
-    is_optional: bool = False  # whether it is written only on request
+    is_optional: bool = False  # whether the label is written only on request
 
 
 # The fields of `Labels`.
@@ -54,12 +54,12 @@ LABELS = {
 
 
 def requested_labels(outputs: Collection[str]) -> frozenset[str]:
-    """Return the names of the labels that outputs need: the optional ones among them, and all others."""
+    """Return the names of the labels to write: all that are not optional, and the optional ones among the outputs."""
     return frozenset(name for name, label in LABELS.items() if name in outputs or not label.is_optional)
 
 
 def _label_offsets(names: Collection[str]) -> Iterator[tuple[str, Label, int]]:
-    """List the labels of these names with the number of values per pixel before each."""
+    """Yield the name, the label and its offset [values per pixel] of the labels of these names."""
     offset = 0
     for name, label in LABELS.items():
         if name in names:
@@ -80,8 +80,8 @@ def label_channels(plane: Any, names: Collection[str]) -> list[tuple[int, int, i
         names: names of the labels.
 
     Returns:
-        For each plane its index, the values per pixel before the label, its position among the planes of the label,
-        their number, and the label.
+        For each plane: its index; the offset of its label [values per pixel]; its position in the label; the number of
+        planes of the label; the label.
     """
     return [
         (getattr(plane, plane_name), offset, n, len(label.planes), label)
@@ -127,10 +127,10 @@ class Stereo(NamedTuple):
     """Labels of a stereo pair of cameras, in the first one's picture; None for those that were not requested.
 
     Attributes:
-        disparity: displacement to the left in the second one's picture [px], shape (height, width); 0 where
+        disparity: displacement to the left from the first to the second picture [px], shape (height, width); 0 where
             nothing is visible.
-        stereo: displacement to the right and down in the second one's picture [px], shape (height, width, 2); NO_FLOW
-            where nothing is visible, and where the visible point is behind the second eye.
+        stereo: displacement to the right and down, likewise [px], shape (height, width, 2); NO_FLOW where nothing is
+            visible, and where the visible point is behind the second eye.
         stereo_occlusion: 255 where the visible point is occluded in the second picture or outside it, else 0, shape
             (height, width).
     """

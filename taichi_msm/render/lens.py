@@ -51,7 +51,7 @@ class Lens(NamedTuple):
         if inverse is not None:
             return inverse
         limit = self.limit
-        # Without the limit itself, which may be a pole.
+        # The limit itself is left out: it may be a pole.
         radii = limit * np.sin(np.linspace(0, np.pi / 2, 4097)[:-1])
         radial = self._replace(coefficients=MODELS[self.model].without_tangential(self.coefficients))
         profile = radial.distort(np.stack([radii, 0 * radii], axis=-1))[..., 0]
@@ -72,7 +72,7 @@ class Lens(NamedTuple):
                     [d * residual[..., 0] - b * residual[..., 1], a * residual[..., 1] - c * residual[..., 0]], axis=-1
                 )
                 points = points + step / (a * d - b * c)[..., None]
-                # Beyond the limit there may be a second solution.
+                # Clamp to the limit: beyond it there may be a second solution.
                 points *= np.minimum(1, limit / np.linalg.norm(points, axis=-1, keepdims=True))
         is_converged = (error <= UNDISTORTION_TOLERANCE) & (np.linalg.norm(points, axis=-1) < limit)
         return np.where(is_converged[..., None], points, np.nan)

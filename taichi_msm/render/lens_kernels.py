@@ -1,7 +1,7 @@
 """Lens distortion in kernels: distorted points, and bounding boxes of distorted cells and triangles.
 
-The formulas are those of `lenses`, the bounds those of `undistortion.VisibleRegion`. Undistorted points are in samples
-of the picture of the same camera without lens distortion.
+The formulas are those of `lenses`, the bounds those of `undistortion.VisibleRegion`. Undistorted points are pixels of
+the same camera without lens distortion, in [samples].
 """
 
 from collections.abc import Callable
@@ -18,8 +18,8 @@ from taichi_msm.system.runtime import ti
 # lens, else 0.
 DISTORTED_STRIDE = 3
 
-# An angle is computed by a power series in the tangent of an eighth of it. The list contains the divisors of the terms,
-# the smallest term first.
+# The arctangent halves the angle HALVINGS times, and sums a power series in the remaining tangent. SERIES has the
+# divisors of its terms, smallest term first.
 HALVINGS = 3
 SERIES = [(-1.0) ** n * (2 * n + 1) for n in reversed(range(12))]
 
@@ -31,7 +31,7 @@ def _arctangent(tangent):
     for _ in ti.static(range(HALVINGS)):
         half_tangent = half_tangent / (1.0 + ti.sqrt(1.0 + half_tangent * half_tangent))
     square = half_tangent * half_tangent
-    # In the precision of the argument: quotients of constants would be f32.
+    # Derived from the argument for its precision: a quotient of constants would be f32.
     unit = half_tangent * 0.0 + 1.0
     total = half_tangent * 0.0
     for divisor in ti.static(SERIES):
@@ -56,8 +56,8 @@ def distorted_point(x, y, uniforms: ti.template(), lens: ti.template()):
         lens: name of the lens model.
 
     Returns:
-        x and y of the distorted point [samples]; and whether the undistorted one is within the limit of the lens.
-        Otherwise, the nearest point within the limit is distorted.
+        x and y of the distorted point [samples], and whether the point is within the limit of the lens. A point beyond
+        it is first moved to the limit.
     """
     a = (x - uniforms[uni.CENTRE_X]) * uniforms[uni.SPREAD_X]
     b = (y - uniforms[uni.CENTRE_Y]) * uniforms[uni.SPREAD_Y]

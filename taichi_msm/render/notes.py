@@ -18,7 +18,7 @@ from taichi_msm.scene.scene import Scene
 def drawing_warnings(scene: Scene) -> Iterator[str]:
     """Yield warnings about the rendering of a scene, one line each."""
     height, width = scene.sheet.size
-    # Tissue is smaller than 5 m; a larger sheet was probably given in millimetres.
+    # Tissue is smaller than 5 m: a larger sheet is probably in millimetres.
     if max(height, width) > 5.0:
         yield (
             f"sheet.size: {height:g} x {width:g} m is large for tissue; if these are millimetres, take "
@@ -37,8 +37,8 @@ def drawing_warnings(scene: Scene) -> Iterator[str]:
             continue
         if instrument.shaft[2] < 0:
             yield (
-                f"probes.{index}.instrument: its shaft points down, through the sheet at rest; it goes from the tip "
-                "to the hand, upward for z above 0"
+                f"probes.{index}.instrument: its shaft points down, through the sheet at rest; take the direction "
+                "from the tip to the hand, with z above 0"
             )
         if instrument.outer_radius > 0.25 * max(scene.sheet.size):
             yield (
@@ -66,7 +66,8 @@ def _describe_lens(camera: Camera, view: View) -> str:
     (x, y), (width, height) = view.centre, view.size
     edges = (view.undistort(np.array([[0, y], [width, y], [x, 0], [x, height]])) - view.centre) / view.scale
     left, right, top, bottom = np.degrees(np.arctan(edges[[0, 1, 2, 3], [0, 0, 1, 1]]))
-    fov = " x ".join("(the lens's)" if np.isnan(angle) else f"{angle:.1f}" for angle in (right - left, bottom - top))
+    angles = right - left, bottom - top
+    fov = " x ".join("(limited by the lens)" if np.isnan(angle) else f"{angle:.1f}" for angle in angles)
     pairs = zip(MODELS[distortion.model].coefficients, distortion.coefficients, strict=True)
     values = "".join(f", {coefficient} {value:g}" for coefficient, value in pairs if value)
     return f"{distortion.model}, {width:g} x {height:g} px, fov {fov} degrees{values or ', no distortion'}"
@@ -82,7 +83,7 @@ def _invisible_sheet(scene: Scene) -> Iterator[str]:
     rate = scene.time.frames_per_second
     for name in scene.render.all_cameras:
         camera = view_at(scene, 0.0, name)
-        # A sheet that is only a dot, as from a camera with lengths in millimetres, is between all of 100 x 100 pixels.
+        # A sheet between 100 x 100 test pixels is only a dot, as from a camera with lengths in millimetres.
         centres = (np.arange(100) + 0.5) / 100
         pixels = camera.undistort(np.stack(np.meshgrid(*(centres * side for side in camera.size)), axis=-1))
         frames = range(scene.time.frames + 1 if is_moving(scene, name) else 1)

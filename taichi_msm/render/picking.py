@@ -17,8 +17,8 @@ Pair = tuple[float, float]
 def pick(position: NDArray[np.floating], refine: int, view: View, pixel: Pair) -> Pair | None:
     """Return the material point at the centre of a pixel, on the nearest triangle there.
 
-    The camera maps a point to (X, Y, w, depth). Then a = X - x w and b = Y - y w are linear in the point, and 0 if it
-    projects to (x, y). Thus there is no division by w, which is 0 or negative behind the camera.
+    A point (X, Y, w, depth) of the camera projects to (x, y) if a = X - x w and b = Y - y w are 0. Both are linear in
+    the point, and need no division by w, which is 0 or negative behind the camera.
 
     Args:
         position: positions of the mass points [m], shape (rows, cols, 3).
@@ -62,11 +62,11 @@ def intersect_rest_plane(view: View, pixel: Pair) -> NDArray[np.floating] | None
 
 
 def _cells_on_ray(position: NDArray[np.floating], ray: View) -> NDArray[np.bool_]:
-    """Mark the cells in which a and b can both be 0."""
+    """Mark the cells in which a and b of `pick` may both be 0."""
     rows, cols = position.shape[:2]
     is_candidate = np.ones((rows - 1, cols - 1), dtype=bool)
     for row in ray.matrix[:2]:
-        # One coordinate at a time, which fits into the cache for large sheets.
+        # One coordinate at a time fits into the cache, also of large sheets.
         value = position @ row[:3] + row[3]
         for half in (value <= 0, value >= 0):
             rows_of_cells = half[:-1] | half[1:]
@@ -84,7 +84,7 @@ def _hits_in_cells(
     a, right, down, opposite = (corners[:, None, None, n] for n in range(4))
     vertex = a + (right - a) * s + (down - a) * t + (opposite - right - down + a) * s * t
     quads = np.stack([vertex[:, :-1, :-1], vertex[:, :-1, 1:], vertex[:, 1:, :-1], vertex[:, 1:, 1:]], axis=-2)
-    # The sub-quads in which a and b can both be 0.
+    # Select the sub-quads in which a and b may both be 0.
     low, high = quads[..., :2].min(axis=-2), quads[..., :2].max(axis=-2)
     cell, quad_row, quad_column = np.nonzero(((low <= 0) & (high >= 0)).all(axis=-1))
     quad = quads[cell, quad_row, quad_column]

@@ -3,7 +3,7 @@
 For each sample of the picture it computes the visible surface: the sheet, or an instrument in front of it
 (coverage.py). From this it writes the colours of pixels, their labels, or both (shading.py). Samples are divided among
 the workers of a CPU in bands (cpu.py), and are threads of a GPU (gpu.py). As in kernel 1, vectors remain vectors down
-to the machine code (docs/decisions/0010); casts, floor and abs of vectors are written accordingly.
+to the machine code (docs/decisions/0010): hence the unusual casts, floors and absolute values of vectors.
 """
 
 from __future__ import annotations

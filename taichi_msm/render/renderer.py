@@ -33,7 +33,7 @@ class Shot(NamedTuple):
 
     positions: Array  # of the mass points [m], shape (rows, cols, 3)
     view: View
-    instruments: Sequence[Solid] = ()  # the instruments
+    instruments: Sequence[Solid] = ()  # bodies of the tools
 
 
 class Renderer:
@@ -226,7 +226,7 @@ class Renderer:
         return self._rasterizers[key]
 
     def _key(self, style: Render, *, picture: bool, labels: Collection[str] = (), camera: View) -> tuple[object, ...]:
-        """Return all settings in which the rasterisers of this scene differ."""
+        """Return the cache key of a rasteriser: all settings in which those of this scene differ."""
         return picture, frozenset(labels), camera.optics, style.shading, style.wireframe, self.scene.shapes
 
     def _texture(self) -> NDArray[np.uint8]:

@@ -1,20 +1,21 @@
 """Shading: texture filtering and lighting of samples, then the colours and labels of pixels.
 
-Wet tissue and metal are lit by an endoscope: its light is next to the main camera, and weakens with distance.
+Wet tissue and metal have the light of an endoscope: next to the main camera, and weaker with distance.
 
 All vectors are in the camera's frame: the eye at 0, x right, y up, z toward the camera. P is the surface point of a
 sample, N its normal on the camera's side, L the unit vector from P to the light, V that from P to the eye, and
 M = 2 (N L) N - L the direction of ideal reflection of the light:
 
-    light    = ambient + (1 - ambient) (N L + wrap) / (1 + wrap) d0 / d / the same at the centre of the picture
+    diffuse  = (N L + wrap) / (1 + wrap) d0 / d
+    light    = ambient + (1 - ambient) diffuse / diffuse0
     colour   = texture light + 255 gloss (M V)^shininess d0 / d
 
-d is the distance from P to the light, and d0 that from the centre of the picture, where a flat sheet that faces the
-camera keeps its colours. Wrapped diffuse light approximates scattering in tissue; no side of a dent is black. An
-instrument shades the tissue near it: at r times its radius from its axis it removes the share uniforms.SHADE / r^2 of
-the light.
+d is the distance of P from the light, d0 that of the main camera's target, and diffuse0 the diffuse light at the
+target, on a sheet that faces the camera: there the sheet keeps its colours. Wrapped diffuse light approximates
+scattering in tissue: no side of a dent is black. An instrument shades the tissue near it: at r radii from its axis, it
+removes the share uniforms.SHADE / r^2 of the light.
 
-The texture is filtered with mipmaps, at 1, 1/2, 1/4, ... of its size, so that a sample of many texels is their mean.
+Mipmaps filter the texture, at 1, 1/2, 1/4, ... of its size, so that a sample of many texels is their mean.
 """
 
 import numpy as np
@@ -62,7 +63,7 @@ def _shade(entry, left, top, texels: ti.template(), band: ti.template()):
 
 @ti.func
 def _write_colours(colour: ti.template(), row, end_row, tile, colours: ti.template(), band: ti.template()):
-    """Write the colours of the tile in column `tile` of tiles, without supersampling."""
+    """Write the colours of a tile, without supersampling; `tile` is its column."""
     packed = ti.floor(colour[0] + 0.5) + ti.floor(colour[1] + 0.5) * 256.0 + ti.floor(colour[2] + 0.5) * 65536.0
     width = ti.static(band.config.tile_width)
     for tile_line in ti.static(range(band.config.tile_height)):
@@ -158,7 +159,7 @@ def resolve(
 
 @ti.func
 def _illuminate(x, y, depth, normal: ti.template(), uniforms: ti.template()):
-    """Return N L; M V; d0 / d; and the upward component of the direction of ideal reflection of V."""
+    """Return N L, M V and d0 / d (see above), and the upward component of the reflected line of sight."""
     offset_x, offset_y = line_of_sight(x, y, uniforms)
     w = w_at(depth, uniforms)
     right, up = offset_x * w, offset_y * w
@@ -167,16 +168,16 @@ def _illuminate(x, y, depth, normal: ti.template(), uniforms: ti.template()):
     # Scalar products before normalisation.
     n_l, n_v, l_v = dot(normal, light), dot(normal, eye), dot(light, eye)
     n_n, l_l, v_v = [ti.max(dot(vector, vector), 1e-30) for vector in ti.static((normal, light, eye))]
-    to_n = 1.0 / n_n
-    # One division for both roots.
-    root_l, root_v = ti.sqrt(l_l), ti.sqrt(v_v)
-    to_both = 1.0 / (root_l * root_v)
-    to_l, to_v = to_both * root_v, to_both * root_l
+    inverse_n_n = 1.0 / n_n
+    # One division for both lengths.
+    length_l, length_v = ti.sqrt(l_l), ti.sqrt(v_v)
+    inverse_both = 1.0 / (length_l * length_v)
+    inverse_l, inverse_v = inverse_both * length_v, inverse_both * length_l
     return (
-        n_l * ti.sqrt(to_n) * to_l,
-        (2.0 * n_l * n_v * to_n - l_v) * to_both,
-        ti.min(uniforms[uni.LIGHT_DISTANCE] * to_l, 4.0),
-        (2.0 * n_v * normal[1] * to_n - eye[1]) * to_v,
+        n_l * ti.sqrt(inverse_n_n) * inverse_l,
+        (2.0 * n_l * n_v * inverse_n_n - l_v) * inverse_both,
+        ti.min(uniforms[uni.LIGHT_DISTANCE] * inverse_l, 4.0),
+        (2.0 * n_v * normal[1] * inverse_n_n - eye[1]) * inverse_v,
     )
 
 
@@ -201,16 +202,16 @@ def _light_transmission(x, y, depth, band: ti.template()):
         base = uni.INSTRUMENTS + index * uni.INSTRUMENT_STRIDE
         tip, axis = triple(uniforms, base + uni.TIP), triple(uniforms, base + uni.AXIS)
         point = [right - tip[0], up - tip[1], depth * (-1.0) - tip[2]]
-        foot = ti.max(ti.min(dot(point, axis), uniforms[base + uni.LENGTH]), 0.0)
-        away = [point[n] - axis[n] * foot for n in ti.static(range(3))]
-        square = uniforms[base + uni.RADIUS] * uniforms[base + uni.RADIUS]
-        transmission *= 1.0 - uni.SHADE * square / ti.max(dot(away, away), square)
+        along = ti.max(ti.min(dot(point, axis), uniforms[base + uni.LENGTH]), 0.0)
+        offset = [point[n] - axis[n] * along for n in ti.static(range(3))]
+        squared_radius = uniforms[base + uni.RADIUS] * uniforms[base + uni.RADIUS]
+        transmission *= 1.0 - uni.SHADE * squared_radius / ti.max(dot(offset, offset), squared_radius)
     return transmission
 
 
 @ti.func
 def _apply_relief(normal: ti.template(), slope_x, slope_y, uniforms: ti.template()):
-    """Tilt normals by the relief, in place, against the gradient of the grey level."""
+    """Tilt normals by the relief, in place: brighter texels are higher."""
     length = 1.0 / ti.max(ti.sqrt(dot(normal, normal)), 1e-30)
     a, b = triple(uniforms, uni.ACROSS), triple(uniforms, uni.UP)
     n = [normal[k] * length for k in ti.static(range(3))]
@@ -243,14 +244,14 @@ def _light_tissue(x, y, depth, normal: ti.template(), slope_x, slope_y, column, 
         diagonal = uniforms[uni.MIDDLE_X] * uniforms[uni.MIDDLE_X] + uniforms[uni.MIDDLE_Y] * uniforms[uni.MIDDLE_Y]
         attenuation = 1.0 - uniforms[uni.VIGNETTE] * (off_x * off_x + off_y * off_y) / diagonal
         factor, gloss = factor * attenuation, gloss * attenuation
-    # The normal of an infinite or NaN point is NaN; the limits remove it.
+    # Infinite or NaN mass points have NaN normals, which these limits replace.
     return ti.max(ti.min(factor, 8.0), 0.0), ti.max(ti.min(gloss, 8.0 * 255.0), 0.0)
 
 
 @ti.func
 def _light_metal(x, y, depth, normal: ti.template(), uniforms: ti.template()):
     """Return the colour of metal, which reflects a room with a bright ceiling and a dark floor."""
-    # Metal at or behind the light is lit as if it were in front of it.
+    # Metal at the light or behind it is lit as if in front of it.
     lit_depth = ti.max(depth, uni.METAL_NEAREST * uniforms[uni.LIGHT_DISTANCE])
     cosine, mirror, _, upward = _illuminate(x, y, lit_depth, normal, uniforms)
     brightness = ti.max(upward, 0.0)
@@ -267,8 +268,8 @@ def pyramid(texture: NDArray[np.uint8], *, minified: bool) -> tuple[NDArray[np.f
         minified: whether all levels are built; otherwise only the first.
 
     Returns:
-        The texels of all levels, row by row, each red + 256 green + 65536 blue, which f32 represents exactly; and for
-        every level its start, width and height, shape (levels, 3).
+        Texels of all levels, row by row, each red + 256 green + 65536 blue, which f32 represents exactly; start, width
+        and height of every level, shape (levels, 3).
     """
     level, texels, levels, first = texture, [], [], 0
     while True:
@@ -312,9 +313,8 @@ def _bilinear(upper_left, upper_right, lower_left, lower_right, u, v):
 def _fetch(first, width, height, x, y, texels: ti.template(), config: ti.template()):
     """Filter a level of the texture bilinearly: return its colour, and with a relief the gradient of the grey level.
 
-    The level has `width` x `height` texels from `first` on; `x` and `y` are column and row in it. The gradient is to
-    the
-    right and down [1/texel].
+    The level has `width` x `height` texels from `first` on; `x` and `y` are column and row in it. The gradient is
+    positive to the right and down [1/texel].
     """
     # Beyond the centres of its outermost texels the texture is constant.
     texel_x = ti.max(ti.min(x, width - 1.0), 0.0)
@@ -354,7 +354,7 @@ def _filter_texture(entry, is_covered, texels: ti.template(), band: ti.template(
         footprint = ti.select(is_covered, samples[entry + plane.footprint], 0.0)
         max_footprint = footprint.max()
         if max_footprint > 1.0:
-            # For every sample, the coarsest level whose texels are at most as large as the sample is blended with the
+            # For every sample, choose the coarsest level with texels no larger than the sample, and blend it with the
             # next coarser one.
             last_level = sizes[uni.LEVEL_COUNT] - 1
             level, bound = 0, 1.0

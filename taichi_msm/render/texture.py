@@ -69,7 +69,7 @@ def is_see_through(scene: Scene) -> bool:
 
 
 def image_problems(scene: Scene) -> Iterator[Problem]:
-    """List the problems of the scene's picture and region, from the header of the file."""
+    """Yield the problems of the scene's picture and region; only the header of the file is read."""
     size = None
     if scene.image is not None:
         try:

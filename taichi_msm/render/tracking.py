@@ -108,13 +108,13 @@ def compute_stereo(
     companion = view.companion
     assert companion is not None
     flow, occlusion = compute_flow(scene, labels.coordinates, position, companion, instruments)
-    shown = np.argwhere(labels.instrument)
-    if len(shown):
-        y, x = shown.T
-        centres = shown[:, ::-1].astype(np.float64) + 0.5
+    instrument_pixels = np.argwhere(labels.instrument)
+    if len(instrument_pixels):
+        y, x = instrument_pixels.T
+        centres = instrument_pixels[:, ::-1].astype(np.float64) + 0.5
         pixels = view.undistort(centres)
         depth = _instrument_depth(scene, pixels, view, instruments)
-        # Rounding to f32 may have drawn a pixel that is just outside the outline.
+        # By rounding to f32, an instrument may cover a pixel just outside its outline.
         depth = np.where(depth < INFINITY, depth, labels.depth[y, x])
         companion_pixels, hidden = _track(
             scene, view.points(pixels, depth), position, companion, instruments, as_flow=False
@@ -125,7 +125,7 @@ def compute_stereo(
 
 
 def _instrument_depth(scene: Scene, pixels: Array, view: View, instruments: Sequence[Solid]) -> Array:
-    """Return the depth of the instruments at undistorted pixels, shape (n, 2) [m]; INFINITY next to them."""
+    """Return the depth [m] of the nearest instrument at undistorted pixels, shape (n, 2); INFINITY without one."""
     launches = Launches(bounded=lanes("f64") == 1)
     uniforms = uni.view_uniforms(view._replace(lens=None), scene, instruments)
     depth = launches.array(np.float64, len(pixels))
@@ -142,8 +142,8 @@ def _track(
 ) -> tuple[NDArray[np.float32], NDArray[np.uint8]]:
     """Return the pixels of points, or their flow, and their occlusion.
 
-    The points are coordinates of material points, shape (n, 2), or points of instruments [m], shape (n, 3). The flow is
-    relative to the pixels of another frame, whose points these are.
+    The points are coordinates of material points, shape (n, 2), or points of instruments [m], shape (n, 3). With
+    `as_flow`, they are the points at all pixels of another frame, row by row; the flow of each starts at its pixel.
     """
     total, is_material = len(points), points.shape[-1] == 2
     if total == 0:
@@ -163,38 +163,40 @@ def _track(
     uniforms = launches.upload(uniform_values)
     sizes = uni.sizes_of(scene, np.empty((0, 3), np.int32))
     sizes[[uni.INSTRUMENT_COUNT, uni.WIDTH, uni.HEIGHT]] = len(instruments), width, height
-    nodes, cell = (launches.array(np.float64, n) for n in (rows * cols * NODE_STRIDE, cells * CELL_STRIDE))
+    nodes, outlines = (launches.array(np.float64, n) for n in (rows * cols * NODE_STRIDE, cells * CELL_STRIDE))
     bounds = launches.array(np.int32, cells * BOUNDS_STRIDE)
     with compilation_options(optimised=False):
         _outline_cells(
-            np.ascontiguousarray(position, np.float64), uniforms, launches.upload(sizes), nodes, cell, bounds
+            np.ascontiguousarray(position, np.float64), uniforms, launches.upload(sizes), nodes, outlines, bounds
         )
     bins = build_bins(launches, bounds, cells, (width, height), bin_size)
     sizes[[uni.BIN_SIZE, uni.BINS_ACROSS, uni.WIDTH, uni.HEIGHT]] = bins.size, bins.columns, *scene.render.size
     is_simple = launches.array(np.uint8, bins.lengths.size)
     launches.launch(
-        _mark_simple_bins, bins.lengths.size, cell, cols, bins.starts, bins.entries, is_simple,
+        _mark_simple_bins, bins.lengths.size, outlines, cols, bins.starts, bins.entries, is_simple,
         rounds=3 * CELLS_AROUND_NODE,
     )  # fmt: skip
     pixels, hidden = launches.array(np.float32, 2 * total), launches.array(np.uint8, total)
     arguments = (
         launches.upload(np.ascontiguousarray(points).ravel()),
-        int(as_flow), uniforms, launches.upload(sizes), nodes, cell, bins.starts, bins.entries, is_simple,
+        int(as_flow), uniforms, launches.upload(sizes), nodes, outlines, bins.starts, bins.entries, is_simple,
         pixels, hidden,
     )  # fmt: skip
     # Iterations per point: one per cell, and one per triangle.
     rounds = 1 + 2 * (scene.render.refine + 1) ** 2
-    for listed, count in launches.chunks(int(bins.lengths.max()), rounds):
+    for chunk_start, chunk_size in launches.chunks(int(bins.lengths.max()), rounds):
         kernel = _kernel(view.lens_model, scene.shapes, is_material)
-        launches.launch(kernel, total, listed, count, *arguments, rounds=count * rounds + len(instruments))
+        launches.launch(
+            kernel, total, chunk_start, chunk_size, *arguments, rounds=chunk_size * rounds + len(instruments)
+        )
     launches.require_completion()
     return launches.download(pixels).reshape(-1, 2), launches.download(hidden)
 
 
 @ti.kernel
 def _outline_cells(
-    position: ti.types.ndarray(dtype=ti.f64, ndim=3), uniforms: Doubles, sizes: Integers, nodes: Doubles, cell: Doubles,
-    bounds: Integers,
+    position: ti.types.ndarray(dtype=ti.f64, ndim=3), uniforms: Doubles, sizes: Integers, nodes: Doubles,
+    outlines: Doubles, bounds: Integers,
 ):  # fmt: skip
     """Project the mass points, and compute the outlines of the cells and their bounds in whole pixels."""
     for index in range(sizes[uni.ROWS] * sizes[uni.COLS]):
@@ -215,23 +217,22 @@ def _outline_cells(
             width, height = ti.cast(sizes[uni.WIDTH], ti.f64), ti.cast(sizes[uni.HEIGHT], ti.f64)
             if geometry.is_off_screen(projected, 0.0, width, 0.0, height):
                 left, right = 1.0, -1.0
-        cell[entry + CELL_MIN_X], cell[entry + CELL_MAX_X] = left, right
-        cell[entry + CELL_MIN_Y], cell[entry + CELL_MAX_Y] = top, bottom
-        cell[entry + CELL_MIN_DEPTH] = ti.min(projected[0][3], projected[1][3], projected[2][3], projected[3][3])
-        cell[entry + CELL_FACING] = facing
+        outlines[entry + CELL_MIN_X], outlines[entry + CELL_MAX_X] = left, right
+        outlines[entry + CELL_MIN_Y], outlines[entry + CELL_MAX_Y] = top, bottom
+        outlines[entry + CELL_MIN_DEPTH] = ti.min(projected[0][3], projected[1][3], projected[2][3], projected[3][3])
+        outlines[entry + CELL_FACING] = facing
         store_bounds(index, left, right, top, bottom, sizes[uni.WIDTH], sizes[uni.HEIGHT], bounds)
 
 
 @ti.kernel
 def _mark_simple_bins(
-    first: ti.i32, end: ti.i32, ended: Integers, cell: Doubles, cols: ti.i32, starts: Integers, entries: Integers,
+    first: ti.i32, end: ti.i32, ended: Integers, outlines: Doubles, cols: ti.i32, starts: Integers, entries: Integers,
     is_simple: Bytes,
 ):  # fmt: skip
     """Mark the bins in which no two cells overlap.
 
-    This holds if the cells of a bin are among the four around one mass point, and these four are invertible and face
-    the same way: each is convex and therefore within the angle of its two edges at the mass point, and the four angles
-    add up to 360 degrees.
+    Such a bin has only cells around one mass point, all of them invertible and facing the same way. Each cell is
+    convex, so it is within the angle between its two edges at the mass point, and these angles add up to 360 degrees.
     """
     for bin_index in range(first, end):
         first_i, last_i, first_j, last_j = 1 << 30, -1, 1 << 30, -1
@@ -243,10 +244,10 @@ def _mark_simple_bins(
         around_node = length <= CELLS_AROUND_NODE and last_i - first_i <= 1 and last_j - first_j <= 1
         if around_node:
             facing_sum, count = 0.0, 0.0
-            # All four must be checked, even those that do not overlap the bin.
+            # Cells that do not overlap the bin are checked, too.
             for i in range(first_i, last_i + 1):
                 for j in range(first_j, last_j + 1):
-                    facing_sum += cell[(i * (cols - 1) + j) * CELL_STRIDE + CELL_FACING]
+                    facing_sum += outlines[(i * (cols - 1) + j) * CELL_STRIDE + CELL_FACING]
                     count += 1.0
             around_node = abs(facing_sum) == count
         is_simple[bin_index] = ti.cast(around_node, ti.u8)
@@ -264,21 +265,22 @@ def _quad_depth(x, y, quad_column, quad_row, quad_side, lower, near, patch: ti.t
 
 @ti.func
 def _cell_occludes(
-    x, y, depth, index, point_cell, point_triangle, cols, subdivisions, near, nodes: ti.template(), cell: ti.template()
-):
+    x, y, depth, index, point_cell, point_triangle, cols, subdivisions, near,
+    nodes: ti.template(), outlines: ti.template(),
+):  # fmt: skip
     """Return whether a cell occludes a point at (x, y) and `depth` on the triangle `point_triangle` of `point_cell`."""
     entry, quad_side = index * CELL_STRIDE, 1.0 / subdivisions
-    facing = cell[entry + CELL_FACING]
+    facing = outlines[entry + CELL_FACING]
     invertible = facing != 0.0
     occluded = False
     # An invertible cell has at most one point on a line of sight.
-    possible = cell[entry + CELL_MIN_DEPTH] < depth and not (index == point_cell and invertible)
+    possible = outlines[entry + CELL_MIN_DEPTH] < depth and not (index == point_cell and invertible)
     if (
         possible
-        and x >= cell[entry + CELL_MIN_X]
-        and x <= cell[entry + CELL_MAX_X]
-        and y >= cell[entry + CELL_MIN_Y]
-        and y <= cell[entry + CELL_MAX_Y]
+        and x >= outlines[entry + CELL_MIN_X]
+        and x <= outlines[entry + CELL_MAX_X]
+        and y >= outlines[entry + CELL_MIN_Y]
+        and y <= outlines[entry + CELL_MAX_Y]
     ):
         corner = geometry.corner_entry(index, cols)
         patch = ti.static(geometry.cell_patch(corner, cols, facing, invertible, nodes, True))
@@ -303,7 +305,7 @@ def _ray_kernel(shapes: tuple[str, ...]) -> Callable[..., None]:
     """Return the kernel that intersects lines of sight with instruments of these shapes."""
 
     @ti.kernel
-    def meet_instruments(
+    def intersect_lines(
         first: ti.i32, end: ti.i32, ended: Integers, pixels: Doubles, uniforms: Doubles, count: ti.i32, depth: Doubles
     ):
         """Compute the depth of the nearest instrument on lines of sight.
@@ -326,7 +328,7 @@ def _ray_kernel(shapes: tuple[str, ...]) -> Callable[..., None]:
             depth[k] = nearest
             end_thread(ended)
 
-    return meet_instruments
+    return intersect_lines
 
 
 @ti.func
@@ -335,8 +337,8 @@ def _instrument_occludes(x, y, depth, uniforms: ti.template(), sizes: ti.templat
     occluded = False
     for index in range(sizes[uni.INSTRUMENT_COUNT]):
         base = uni.INSTRUMENTS + index * uni.INSTRUMENT_STRIDE
-        is_between = x >= uniforms[base + uni.LEFT] and x <= uniforms[base + uni.RIGHT]
-        if is_between and y >= uniforms[base + uni.TOP] and y <= uniforms[base + uni.BOTTOM]:
+        is_in_columns = x >= uniforms[base + uni.LEFT] and x <= uniforms[base + uni.RIGHT]
+        if is_in_columns and y >= uniforms[base + uni.TOP] and y <= uniforms[base + uni.BOTTOM]:
             hit_depth, _, _, _ = intersect_instrument(x, y, index, uniforms, shapes)
             if hit_depth < depth and geometry.w_at(hit_depth, uniforms) > uniforms[uni.NEAR]:
                 occluded = True
@@ -378,8 +380,8 @@ def _kernel(lens: str, shapes: tuple[str, ...], is_material: bool) -> Callable[.
 
     @ti.kernel
     def locate_kernel(
-        first: ti.i32, end: ti.i32, ended: Integers, listed: ti.i32, count: ti.i32, points: Points,
-        as_flow: ti.i32, uniforms: Doubles, sizes: Integers, nodes: Doubles, cell: Doubles,
+        first: ti.i32, end: ti.i32, ended: Integers, chunk_start: ti.i32, chunk_size: ti.i32, points: Points,
+        as_flow: ti.i32, uniforms: Doubles, sizes: Integers, nodes: Doubles, outlines: Doubles,
         starts: Integers, entries: Integers, is_simple: Bytes, pixels: Floats, hidden: Bytes,
     ):  # fmt: skip
         """Project points, and test their occlusion by a chunk of the cells in their bins.
@@ -388,20 +390,20 @@ def _kernel(lens: str, shapes: tuple[str, ...], is_material: bool) -> Callable[.
             first: first point of the launch.
             end: point after the last one.
             ended: counter of finished threads, for `end_thread`.
-            listed: position of the first cell in its list.
-            count: number of cells.
+            chunk_start: position of the first cell of the chunk in each list.
+            chunk_size: number of cells of the chunk.
             points: coordinates of material points on the sheet, shape (2 * n,); of instruments X, Y, w and depth of
                 points, shape (4 * n,).
-            as_flow: 0 for pixels; 1 for displacements from the pixel centres of another frame, whose points these are.
+            as_flow: 0 for pixels; 1 for displacements, where point k starts at the centre of pixel k of another frame.
             uniforms: constants of the view without distortion, and the lens.
             sizes: sizes and counters, as returned by `sizes_of`.
             nodes: projected mass points, NODE_STRIDE numbers each.
-            cell: outlines of the cells, CELL_STRIDE numbers each.
+            outlines: outlines of the cells, CELL_STRIDE numbers each.
             starts: start of the list of each bin.
             entries: cells of all lists.
             is_simple: whether no two cells of a bin overlap.
             pixels: pixels or displacements [px], shape (2 * n,), written.
-            hidden: whether the points are hidden, shape (n,), updated.
+            hidden: whether the points are occluded or outside the picture, shape (n,), updated.
         """
         for k in range(first, end):
             cols, width, height = sizes[uni.COLS], sizes[uni.WIDTH], sizes[uni.HEIGHT]
@@ -423,12 +425,12 @@ def _kernel(lens: str, shapes: tuple[str, ...], is_material: bool) -> Callable[.
                         bin_index = ti.cast(undistorted_y, ti.i32) // sizes[uni.BIN_SIZE] * sizes[uni.BINS_ACROSS]
                         bin_index += ti.cast(undistorted_x, ti.i32) // sizes[uni.BIN_SIZE]
                         if is_simple[bin_index] == 0:
-                            begin = starts[bin_index] + listed
-                            for n in range(begin, ti.min(begin + count, starts[bin_index + 1])):
+                            begin = starts[bin_index] + chunk_start
+                            for n in range(begin, ti.min(begin + chunk_size, starts[bin_index + 1])):
                                 if not is_hidden:
                                     is_hidden = _cell_occludes(
                                         undistorted_x, undistorted_y, depth, entries[n], point_cell, point_triangle,
-                                        cols, subdivisions, near, nodes, cell,
+                                        cols, subdivisions, near, nodes, outlines,
                                     )  # fmt: skip
                         if ti.static(len(shapes) > 0):
                             is_hidden = is_hidden or _instrument_occludes(
@@ -442,7 +444,7 @@ def _kernel(lens: str, shapes: tuple[str, ...], is_material: bool) -> Callable[.
                 y = ti.select(is_visible, y - ti.cast(k // width, ti.f64) - 0.5, NO_FLOW)
             pixels[2 * k] = ti.cast(x, ti.f32)
             pixels[2 * k + 1] = ti.cast(y, ti.f32)
-            if listed > 0:
+            if chunk_start > 0:
                 is_hidden = is_hidden or hidden[k] > 0
             hidden[k] = ti.cast(is_hidden, ti.u8)
             end_thread(ended)

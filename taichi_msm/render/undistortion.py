@@ -1,6 +1,6 @@
-"""Undistortion maps: the undistorted position of every sample of a picture, computed once per lens and picture size.
+"""Undistortion maps: undistorted positions of the samples of a picture, computed once per lens and picture size.
 
-With this map, and with bounds of the distortion of cells, kernel 2 covers distorted pictures like undistorted ones.
+The map, and bounds of the distortion of a cell, let kernel 2 cover distorted pictures like undistorted ones.
 """
 
 from __future__ import annotations
@@ -24,8 +24,8 @@ INVALID_COORDINATE = 1e9
 class VisibleRegion(NamedTuple):
     """Visible region of the plane at depth 1, with bounds of the lens distortion in it.
 
-    A line of length L is distorted into a curve whose distance from its chord is at most `sagitta_factor` L^2, because
-    its second derivatives are at most 8 `sagitta_factor`. The length of the curve is at most 2 `stretch_factor` L.
+    Distortion bends a line of length L into a curve at most `sagitta_factor` L^2 from its chord: the second derivatives
+    are at most 8 `sagitta_factor`. The length of the curve is at most 2 `stretch_factor` L.
     """
 
     radius: float  # largest distance from the optical axis, in normalised image coordinates
@@ -50,7 +50,7 @@ def _visible_region(lens: Lens, scale: Pair, centre: Pair, size: Pair) -> Visibl
         border = np.array([[-radius, -radius], [radius, radius]])
     # With a margin of one pixel, the sampling distance of the border.
     (left, top), (right, bottom) = border.min(axis=0) * scale + centre - 1, border.max(axis=0) * scale + centre + 1
-    # The derivatives of the lens are bounded by their maximum on a polar grid, with a safety factor.
+    # Bounds of the derivatives: their maximum on a polar grid, with a safety factor.
     radii, angles = np.meshgrid(radius * np.linspace(0, 1, 256), np.linspace(0, 2 * np.pi, 64))
     points = np.stack([radii * np.cos(angles), radii * np.sin(angles)], axis=-1)
     step = 1e-5 * radius
@@ -67,7 +67,7 @@ def _visible_region(lens: Lens, scale: Pair, centre: Pair, size: Pair) -> Visibl
 
 
 def undistorted_view(view: View) -> View:
-    """Return a camera with the same visible region without lens distortion; for wide lenses its resolution is lower."""
+    """Return a camera with the same visible region, but no lens distortion; wide lenses lose resolution."""
     left, right, top, bottom = visible_region(view).box
     # The undistorted picture is at most four times as large as the distorted one.
     view_scale = min(1.0, 4 * float(view.size.max()) / max(right - left, bottom - top))
@@ -89,8 +89,8 @@ def undistortion_map(view: View, supersample: int, *, with_steps: bool) -> NDArr
         with_steps: whether the steps to the next samples are included.
 
     Returns:
-        x and y [samples], INVALID_COORDINATE beyond the limit of the lens, shape (rows, columns, 2). With steps also x
-        and y of the step to the next sample on the right and of that to the next one below, shape (rows, columns, 6).
+        x and y [samples], INVALID_COORDINATE beyond the limit of the lens, shape (rows, columns, 2). With steps, shape
+        (rows, columns, 6): also x and y of the step to the right sample, and x and y of the step to the lower one.
     """
     assert view.lens is not None
     width, height = (int(side) * supersample for side in view.size)

@@ -23,13 +23,13 @@ WIRE_COLOUR = (235, 245, 255)
 WIRE_WIDTH = 1.0
 WIRE_OPACITY = 0.75
 
-# Maximum size of a tissue sample on the texture that is filtered at full resolution [texels]: the filter has two.
+# Largest size of a sample on the texture that is filtered at full resolution [texels]; the bilinear filter spans two.
 FULL_RESOLUTION_TEXELS = 2.0
 
 # Offset of the light from the eye, to the right and up, as a fraction of the distance to the target.
 LIGHT_RIGHT, LIGHT_UP = -0.3, 0.0
 
-# Wrap of diffuse light, and sharpness of highlights: (M V)^(2^SHARPNESS).
+# Wrap of diffuse light; logarithm of the shininess of highlights, 2^SHARPNESS (shading.py).
 WRAP = 0.3
 SHARPNESS = 3
 
@@ -71,7 +71,7 @@ ACROSS, UP, SLOPE_X, SLOPE_Y = 44, 47, 50, 51
 # Offset of a mass point's x and y in the picture, after its X, Y, w and depth.
 SCREEN = 4
 
-# The depth by which an occluding surface must be nearer than a point [m].
+# Depth by which a surface must be nearer than a point to occlude it [m].
 DEPTH_TOLERANCE = 52
 
 # The lens: its coefficients; its radius at w = 1 [m]; the principal point [samples]; samples per metre at w = 1; the
@@ -79,7 +79,7 @@ DEPTH_TOLERANCE = 52
 LENS, LENS_RADIUS, PICTURE_X, PICTURE_Y, FOCAL_X, FOCAL_Y, VISIBLE = 53, *range(61, 67)
 SAGITTA_FACTOR, STRETCH_FACTOR = 70, 71
 
-# The light's position toward the camera, in its frame [m]; the direction to the headlight, in the world.
+# The light's position toward the camera, in the camera's frame [m]; the direction to the headlight, in the world.
 LIGHT_Z, HEADLIGHT = 72, 73
 
 # The instruments, each with the centre of its tip and its axis in the camera's frame; its length and radius; its
@@ -166,12 +166,12 @@ def _instrument_uniforms(solid: Solid, view: View, factor: int) -> Array:
     uniforms[TIP:AXIS] = view.axes @ (solid.tip - view.eye)
     uniforms[AXIS:LENGTH] = view.axes @ solid.axis
     uniforms[[LENGTH, RADIUS]] = solid.length, solid.radius
-    # The shape is within the convex hull of a cube around each end.
+    # The convex hull of two cubes, one around each end, contains the shape.
     ends = np.stack([solid.tip, solid.tip + solid.axis * solid.length])
     corner = np.array(np.meshgrid(*[(-solid.radius, solid.radius)] * 3)).reshape(3, -1).T @ view.axes
     boxes = (ends[:, None] + corner).reshape(-1, 3)
     x, y, w, _ = view.project(boxes).T
-    # Without distortion, as all coordinates in kernels.
+    # Undistorted, as all coordinates in kernels.
     left, right, top, bottom = (0, view.size[0], 0, view.size[1]) if view.lens is None else visible_region(view).box
     low, high = np.array([left, top]), np.array([right, bottom])
     if (w > view.near).all():

@@ -437,7 +437,7 @@ def test_field_of_view_beyond_the_projection(small: Path, capsys: pytest.Capture
     Path("camera.yml").write_text("K: [11, 0, 19.5, 0, 11, 14.5, 0, 0, 1]\nD: [0, 0, 0, 0]\nfisheye: true\n")
     camera = READ.replace("FILE", "camera.yml, outside: background")
     assert not main(["check", "small.yaml", "--set", camera, "--set", "output=[]"])
-    assert "40 x 30 px, fov (the lens's) x 156.3 degrees" in capsys.readouterr().out
+    assert "40 x 30 px, fov (limited by the lens) x 156.3 degrees" in capsys.readouterr().out
 
 
 def test_focal_length_in_other_units(small: Path, message: Messages) -> None:
