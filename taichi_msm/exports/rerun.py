@@ -4,7 +4,9 @@
     world/tools/0           capsule of the instrument of a probe, by the number of the probe
     world/tracks            positions of the tracked points
     world/camera            pose and pinhole of the camera; world/cameras/NAME for each of several
-    world/camera/picture    frames; depth next to it [m], and flow as a tensor, shape (height, width, 2) [px]
+    world/camera/picture    frames
+    world/camera/depth      depth [m]
+    world/camera/flow       flow [px], a tensor of shape (height, width, 2)
 
 Lengths are in metres, in the world of the scene, with y up. The timelines are `frame` and `time` [s]. Pixels count from
 the picture's upper left corner, as Rerun's do. Rerun has no lens distortion: pictures are exported as drawn.
@@ -53,7 +55,7 @@ def _write_run(run: FinishedRun, path: Path, progress: ProgressCallback) -> list
     with rerun.RecordingStream("taichi_msm", recording_id=identity) as recording:
         recording.save(path)
         recording.send_recording_name(run.directory.name)
-        # Without the timelines of the export itself.
+        # The time of the export is not a timeline of the recording.
         recording.set_log_time_enabled(False)
         recording.set_log_tick_enabled(False)
         _log_run(run, recording, progress)
@@ -61,7 +63,7 @@ def _write_run(run: FinishedRun, path: Path, progress: ProgressCallback) -> list
         recording.disconnect()
     views = _views(run).values()
     missing = [key for key in FORMATS["rerun"].optional_outputs if not any(each.has_output(key) for each in views)]
-    notes = [f"without {key}, which is not among the results; {run.remedy(key)}" for key in missing]
+    notes = [f"the results have no {key}; {run.remedy(key)}" for key in missing]
     if any(view_at(run.scene, 0.0, each.camera).lens is not None for each in views):
         notes.append(
             "Rerun has no lens distortion, so projected points deviate from the pictures of a distorted camera"
@@ -109,7 +111,7 @@ def _log_run(run: FinishedRun, recording: Any, progress: ProgressCallback) -> No
 
 
 def _mesh(run: FinishedRun, position: NDArray[np.floating], *, is_first: bool) -> Any:
-    """Build the mesh of the first frame, or the vertices of a later one, for which the viewer keeps the rest."""
+    """Build the mesh of the first frame, or only vertices of a later one; the viewer keeps triangles and texture."""
     vertices: dict[str, Any] = {"vertex_positions": position.reshape(-1, 3), "vertex_normals": unit_normals(position)}
     if not is_first:
         return rerun.Mesh3D.from_fields(**vertices)
