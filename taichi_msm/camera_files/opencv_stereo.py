@@ -24,12 +24,12 @@ def _cameras(file: CameraFile) -> Sequence[Keys]:
     """Return the keys of each camera and those without a mark; an empty list unless both cameras have a matrix."""
     data = _flatten_sections(file.data)
     for marks in MARKS:
-        eyes = [_marked(data, mark) for mark in marks]
-        matrices = [[key for key, name in eye.items() if re.fullmatch(MATRIX, name)] for eye in eyes]
+        sides = [_strip_mark(data, mark) for mark in marks]
+        matrices = [[key for key, name in side.items() if re.fullmatch(MATRIX, name)] for side in sides]
         if all(any(len(flat(data[key])) == 9 for key in keys) for keys in matrices):
-            shared = {key: fold(key) for key in data if not any(key in eye for eye in eyes)}
-            folded = [{**shared, **eye} for eye in eyes]
-            return [Keys(file, {key: data[key] for key in names}, names, data.lines) for names in folded]
+            unmarked = {key: fold(key) for key in data if not any(key in side for side in sides)}
+            names_by_key = [{**unmarked, **side} for side in sides]
+            return [Keys(file, {key: data[key] for key in names}, names, data.lines) for names in names_by_key]
     return ()
 
 
@@ -55,7 +55,7 @@ def _flatten_sections(data: Entries) -> Entries:
     return Entries(flattened, lines)
 
 
-def _marked(keys: Iterable[str], mark: str) -> dict[str, str]:
+def _strip_mark(keys: Iterable[str], mark: str) -> dict[str, str]:
     """Return the keys that have a mark; folded names without the mark, by key."""
     matches = {key: re.fullmatch(mark, str(key)) for key in keys}
     return {key: fold("".join(filter(None, match.groups()))) for key, match in matches.items() if match}

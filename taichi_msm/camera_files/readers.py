@@ -96,7 +96,7 @@ def read_poses(path: str, keys: PoseKeys = PoseKeys()) -> tuple[tuple[float, ...
     trajectory = next(found for reader in TRAJECTORY_READERS if (found := reader.read(file)) is not None)
     if not trajectory.rows:
         raise file.fault("no poses; expected lines t tx ty tz qx qy qz qw")
-    scale = LENGTH_UNITS[_agreed(file, "poses_unit", keys.poses_unit, trajectory.length_unit) or "m"]
+    scale = LENGTH_UNITS[_agreed_unit(file, "poses_unit", keys.poses_unit, trajectory.length_unit) or "m"]
     times = _times(file, trajectory, keys)
     rows: list[tuple[float, ...]] = []
     for n, time, (_, x, y, z, *quaternion) in zip(trajectory.lines, times, trajectory.rows, strict=True):
@@ -120,7 +120,7 @@ def _times(file: CameraFile, trajectory: Trajectory, keys: PoseKeys) -> list[flo
     else:
         if keys.poses_rate is not None:
             raise file.fault("has times; remove poses_rate")
-        unit = _agreed(file, "poses_time", keys.poses_time, trajectory.time_unit)
+        unit = _agreed_unit(file, "poses_time", keys.poses_time, trajectory.time_unit)
         # 1e11 s is in the year 5138.
         if unit is None and max(map(abs, numbers)) > 1e11:
             raise file.fault(f"has the time {numbers[0]:.0f}, hardly in seconds; set poses_time: s, ms, us or ns")
@@ -136,7 +136,7 @@ def _times(file: CameraFile, trajectory: Trajectory, keys: PoseKeys) -> list[flo
     return [round(time - origin, digits) for time in times]
 
 
-def _agreed(file: CameraFile, key: str, value: str | None, found: str | None) -> str | None:
+def _agreed_unit(file: CameraFile, key: str, value: str | None, found: str | None) -> str | None:
     """Return the unit from a key of the camera or from the header of the file; None without both."""
     if value is not None and found is not None and value != found:
         raise file.fault(f"its header has {found}, and {key} is {value}; keep the right one")

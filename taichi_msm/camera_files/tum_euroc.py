@@ -108,12 +108,12 @@ def _row(
         needed = f"eight numbers up to {MAX_NUMBER:g}: {' '.join(COLUMNS)}"
         if expected.column_count != TUM.column_count:
             needed = f"{expected.column_count} numbers up to {MAX_NUMBER:g}, one a column of the header"
-        origin = ""
+        hint = ""
         if columns is None and len(words) == 17:
-            origin = ", but 17 numbers, as EuRoC's; keep their header"
+            hint = ", but 17 numbers, as EuRoC's; keep their header"
         elif columns is None and separated:
-            origin = "; numbers with decimal commas need ; between them"
-        raise file.fault(f"not a pose{origin}; expected {needed}", line)
+            hint = "; numbers with decimal commas need ; between them"
+        raise file.fault(f"not a pose{hint}; expected {needed}", line)
     if separated and columns is None:
         fault = "commas without a header, so w may be first, as in EuRoC, or last, as in TUM"
         raise file.fault(f"{fault}; name the columns in a first line: # {', '.join(COLUMNS)}", line)

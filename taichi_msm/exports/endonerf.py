@@ -77,11 +77,11 @@ write = one_folder_per_run(_write_run)
 
 def _require_central(camera: Pinhole, size: tuple[int, int], run: FinishedRun) -> None:
     """Raise an ArgumentError unless the focal lengths are equal and the principal point is centred."""
-    across, down = camera.focal.tolist()
+    focal_x, focal_y = camera.focal.tolist()
     x, y = (camera.centre - np.array(size) / 2).tolist()
     faults = []
-    if abs(across / down - 1) > 1e-6:
-        faults.append(f"its focal lengths are {across:g} and {down:g} px")
+    if abs(focal_x / focal_y - 1) > 1e-6:
+        faults.append(f"its focal lengths are {focal_x:g} and {focal_y:g} px")
     # The loaders' principal point is the centre of the pixel to the lower right of the picture's centre.
     if max(abs(x), abs(y)) > 0.5 + 1e-6:
         faults.append(f"its principal point is {x:g} px to the right of and {y:g} px below the centre")

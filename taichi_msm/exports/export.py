@@ -105,15 +105,15 @@ def export(
     finished, incomplete = read_runs(directories)
     if camera is not None and not any(run.camera_names() for run in finished):
         raise ArgumentError(f"camera: {camera!r}; {finished[0].directory} has one unnamed camera; remove camera")
-    views = [_camera_views(run, format, camera) for run in finished]
-    exported = _write_export(views, format, directory, progress)
+    camera_runs = [_select_cameras(run, format, camera) for run in finished]
+    exported = _write_export(camera_runs, format, directory, progress)
     if incomplete:
         count = f"{incomplete} of {incomplete + len(finished)} runs"
         exported.notes.insert(0, f"incomplete runs are left out, {count}; the sweep's table.csv has the reasons")
     return exported
 
 
-def _camera_views(run: FinishedRun, name: str, camera: str | None) -> list[FinishedRun]:
+def _select_cameras(run: FinishedRun, name: str, camera: str | None) -> list[FinishedRun]:
     """Select the cameras of a run that a format exports; return a copy of the run per camera."""
     export_format, known = FORMATS[name], run.camera_names()
     exported = export_format.cameras
@@ -134,10 +134,10 @@ def _camera_views(run: FinishedRun, name: str, camera: str | None) -> list[Finis
 
 
 def _write_export(
-    views: Sequence[Sequence[FinishedRun]], name: str, directory: Path, progress: ProgressCallback
+    camera_runs: Sequence[Sequence[FinishedRun]], name: str, directory: Path, progress: ProgressCallback
 ) -> Exported:
-    """Write an export atomically; `views` has the copies of each run by `_camera_views`."""
-    runs = [run for run, *_ in views]
+    """Write an export atomically; `camera_runs` has the copies of each run from `_select_cameras`."""
+    runs = [run for run, *_ in camera_runs]
     export_format, total, done = FORMATS[name], sum(run.frames for run in runs), 0
     write: FormatWriter = import_module(f"taichi_msm.exports.{export_format.module or name}").write
     sources, is_numbered = [], len(runs) > 1
@@ -155,7 +155,7 @@ def _write_export(
         exclusive=True,
     )
     with writing(directory), Publication(directory, spec) as publication:
-        for run in chain.from_iterable(views):
+        for run in chain.from_iterable(camera_runs):
             with run.unchanged():
                 if missing := [key for key in export_format.required_outputs if not run.has_output(key)]:
                     remedy = run.remedy(*export_format.required_outputs, *export_format.optional_outputs)

@@ -175,7 +175,7 @@ def read_pinhole(run: FinishedRun, name: str) -> Pinhole:
         ArgumentError: when the camera is orthographic or has lens distortion.
     """
     path = run.directory / run.camera / CAMERA_FILE
-    another = "choose another camera by --camera, or " if FORMATS[name].cameras == ANY_CAMERA else ""
+    alternative = "choose another camera by --camera, or " if FORMATS[name].cameras == ANY_CAMERA else ""
     with reading(path):
         # The limit of 32 MiB suffices for 100,000 poses.
         camera = json.loads(read_regular(run.require_own_file(path, FORMATS[name].required_outputs[0]), 1 << 25))
@@ -184,10 +184,10 @@ def read_pinhole(run: FinishedRun, name: str) -> Pinhole:
         is_pinhole = "intrinsics" in camera
     if not is_pinhole:
         fault = f"{name} needs a pinhole camera, and {path} is orthographic"
-        raise ArgumentError(f"{fault}; {another}run the scene with a pinhole camera")
+        raise ArgumentError(f"{fault}; {alternative}run the scene with a pinhole camera")
     if is_distorted:
         fault = f"{path}: the camera has lens distortion, which {name} cannot describe"
-        raise ArgumentError(f"{fault}; {another}run the scene without it")
+        raise ArgumentError(f"{fault}; {alternative}run the scene without it")
     with reading(path):
         matrix = np.array(camera["intrinsics"], float)
         poses = np.array(camera.get("poses", [camera["pose"]] * run.frames), float)[: run.frames]

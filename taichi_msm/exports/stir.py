@@ -57,18 +57,18 @@ def _write_run(run: FinishedRun, folder: Path, progress: ProgressCallback) -> li
         raise NotInstalledError(f"--format {outputs.PYAV_NOT_INSTALLED.replace('mp4', FORMAT_NAME, 1)}")
     runs = [replace(run, camera=side) for side in CAMERAS]
     folder.mkdir()
-    left, right = (read_pinhole(each, FORMAT_NAME) for each in runs)
+    left, right = (read_pinhole(camera_run, FORMAT_NAME) for camera_run in runs)
     baseline = _baseline(run, left, right)
     write_new_file(folder / "calib.json", (json.dumps(_calibration(left, right, baseline), indent=2) + "\n").encode())
     radius = max(1, round(run.scene.render.size[0] / 160))
     pixels, tracks = _choose_tracks(runs, radius)
-    for number, each in enumerate(runs):
-        sequence = folder / each.camera / "seq00"
+    for number, camera_run in enumerate(runs):
+        sequence = folder / camera_run.camera / "seq00"
         (sequence / "segmentation").mkdir(parents=True)
         for name, centres in zip(("start", "end"), pixels[number], strict=True):
             mask = encode_picture(_discs(centres, run.scene.render.size, radius), "PNG")
             write_new_file(sequence / "segmentation" / f"icg{name}seg.png", mask)
-        _write_frames(each, sequence, partial(_report_progress, progress, number))
+        _write_frames(camera_run, sequence, partial(_report_progress, progress, number))
     return _notes(run.scene.render.size, pixels, tracks, baseline)
 
 

@@ -129,7 +129,7 @@ class Camera(Section):
 
     calibration: FilePath | None = key(
         None,
-        "in place of fov and distortion: calibration file of OpenCV, ROS, SCARED, STIR, StereoMIS, Kalibr or COLMAP, "
+        "in place of fov and distortion: calibration of OpenCV, ROS, SCARED, STIR, StereoMIS, Kalibr or COLMAP, a file "
         "relative to the scene file",
         "the path of a file",
     )
@@ -142,17 +142,17 @@ class Camera(Section):
     scale: StrictBool = key(False, "scale a calibration of another picture size to this one", "true or false")
     intrinsics: Intrinsics | None = key(
         None,
-        "in place of fov: focal lengths and principal point, in OpenCV's pixels",
+        "in place of fov: focal lengths and principal point, in OpenCV's pixel coordinates",
         "a mapping with fx, fy, cx and cy",
     )
     distortion: Distortion | None = key(
         None,
-        "lens distortion, in OpenCV's terms",
+        "lens distortion: model and coefficients, as in OpenCV",
         "a mapping with k1, k2, p1, p2, k3 to k6, or with another model and its coefficients",
     )
     outside: Literal["refuse", "background"] = key(
         "refuse",
-        "treatment of pixels where the distortion is not invertible: refuse the scene, or draw the background",
+        "pixels where the distortion is not invertible: refuse the scene, or draw the background",
         "refuse or background",
     )
     pose: Pose | None = key(
@@ -257,7 +257,7 @@ class Camera(Section):
     @field_validator("eye", "target", "up", mode="after")
     @classmethod
     def _check_order(cls, keyframes: Any, info: ValidationInfo) -> Any:
-        if info.field_name == "eye" and keyframes is None and not {"beside", "pose", "poses"} & _given(info):
+        if info.field_name == "eye" and keyframes is None and not {"beside", "pose", "poses"} & _given_before(info):
             raise scene_fault("missing; expected " + cls.model_fields["eye"].json_schema_extra["expects"])  # type: ignore
         if keyframes is not None and isinstance(keyframes[0], tuple):
             require_increasing(keyframes)
@@ -407,7 +407,7 @@ class Camera(Section):
         return calibration.right._asdict()
 
 
-def _given(info: ValidationInfo) -> set[str]:
+def _given_before(info: ValidationInfo) -> set[str]:
     """Return the keys declared before the validated one that have a value, valid or not."""
     fields = list(Camera.model_fields)
     previous = fields[: fields.index(str(info.field_name))]

@@ -109,7 +109,7 @@ class Render(Section):
             if name in PRESETS and camera != name:
                 raise scene_fault("is the name of a built-in camera; take another name", name)
             if isinstance(camera, Camera) and camera.beside is not None:
-                _check_beside(name, cameras)
+                _check_reference_camera(name, cameras)
         loaded = {}
         for name, camera in cameras.items():
             try:
@@ -183,7 +183,7 @@ def _read_files(camera: AnyCamera, info: ValidationInfo) -> AnyCamera:
     return camera.calibrated(info.data["size"]) if "size" in info.data else camera
 
 
-def _check_beside(name: str, cameras: Mapping[str, AnyCamera]) -> None:
+def _check_reference_camera(name: str, cameras: Mapping[str, AnyCamera]) -> None:
     """Check that the chain of reference cameras of a camera ends at a camera with a pose."""
     if name == next(iter(cameras)):
         raise scene_fault(

@@ -150,7 +150,7 @@ class Scene(Section):
         return folders
 
     def asks_for(self, *sources: str) -> bool:
-        """Return whether any output has one of these sources (see `Output.source`)."""
+        """Return whether any output has one of the sources, values of `Output.source`."""
         return any(OUTPUTS[name].source in sources for name in self.output)
 
     @property

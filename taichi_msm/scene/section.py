@@ -64,8 +64,8 @@ def key_problems(error: ValidationError, section: type[BaseModel], data: Any) ->
     """
     # A broken file of the largest size could have tens of thousands of faults.
     errors = error.errors(include_url=False, include_input=False)[:1000]
-    faults = [_fault(details, section) for details in errors]
-    return [Problem(fault.path, _message(fault, data)) for fault in _merge_missing_items(_choose_kinds(faults))]
+    faults = [_locate(details, section) for details in errors]
+    return [Problem(fault.path, _message(fault, data)) for fault in _merge_missing_items(_choose_members(faults))]
 
 
 class _Fault(NamedTuple):
@@ -79,7 +79,7 @@ class _Fault(NamedTuple):
     branches: tuple[tuple[Key, str], ...]  # keys with a union type, each with the member that failed
 
 
-def _fault(error: ErrorDetails, section: type[BaseModel]) -> _Fault:
+def _locate(error: ErrorDetails, section: type[BaseModel]) -> _Fault:
     """Locate an error in the scene: its path without pydantic's names of union members."""
     path: Key = ()
     field = None
@@ -90,42 +90,42 @@ def _fault(error: ErrorDetails, section: type[BaseModel]) -> _Fault:
         if part not in section.model_fields:
             continue
         field = section.model_fields[str(part)]
-        kinds = _kinds(field.annotation)
+        kinds = _union_members(field.annotation)
         if get_origin(kinds[0]) is dict:  # a mapping from names
-            kinds = _kinds(get_args(kinds[0])[1])
+            kinds = _union_members(get_args(kinds[0])[1])
             path += tuple(islice(parts, 1))
         if len(kinds) > 1:
             branches += ((path, str(next(parts, ""))),)
-        section = next(_sections(field.annotation), section)
+        section = next(_section_types(field.annotation), section)
     path += error.get("ctx", {}).get("below", ())
     return _Fault(path, error, error["type"], section, field, branches)
 
 
-def _kinds(annotation: Any) -> list[Any]:
+def _union_members(annotation: Any) -> list[Any]:
     """Return the members of a union type without None; for another type, a list of it."""
     if get_origin(annotation) not in (Union, UnionType):
         return [annotation]
     return [kind for kind in get_args(annotation) if kind is not type(None)]
 
 
-def _words(annotation: Any, depth: int) -> Iterator[str]:
-    """Yield the values of the Literals of an annotation that are nested in `depth` tuples."""
+def _literals(annotation: Any, depth: int) -> Iterator[str]:
+    """Yield the values of Literals nested in `depth` tuples of an annotation."""
     if get_origin(annotation) is Literal:
         yield from get_args(annotation) if depth == 0 else ()
         return
     for argument in get_args(annotation):
-        yield from _words(argument, depth - (get_origin(annotation) is tuple))
+        yield from _literals(argument, depth - (get_origin(annotation) is tuple))
 
 
-def _sections(annotation: Any) -> Iterator[type[BaseModel]]:
+def _section_types(annotation: Any) -> Iterator[type[BaseModel]]:
     """Iterate over the sections of an annotation such as tuple[Probe, ...]."""
     if isinstance(annotation, type) and get_origin(annotation) is None and issubclass(annotation, BaseModel):
         yield annotation
     for argument in get_args(annotation):
-        yield from _sections(argument)
+        yield from _section_types(argument)
 
 
-def _choose_kinds(faults: Sequence[_Fault]) -> Iterator[_Fault]:
+def _choose_members(faults: Sequence[_Fault]) -> Iterator[_Fault]:
     """For a value of a union type, keep the faults of the member that the value most probably is.
 
     That member has the deepest fault. If two are equally deep, the value as a whole is the fault.
@@ -176,7 +176,7 @@ def _message(fault: _Fault, data: Any) -> str:
     if limit in (MAX_MAGNITUDE, -MAX_MAGNITUDE) or (limit == MIN_MAGNITUDE and data > 0):
         return f"{format_value(data)} is out of range; magnitudes are {MIN_MAGNITUDE:g} to {MAX_MAGNITUDE:g}"
     is_item = isinstance(fault.path[-1], int)
-    hint = did_you_mean(data, _words(fault.field.annotation, is_item)) if isinstance(data, str) else ""
+    hint = did_you_mean(data, _literals(fault.field.annotation, is_item)) if isinstance(data, str) else ""
     return f"{format_value(data)} is not allowed; {expected}{hint}"
 
 
@@ -186,7 +186,7 @@ MAX_PROBES = 16
 MAX_PIXELS = 8192  # width or height of a frame
 MAX_SUPERSAMPLE = 4
 
-# Approximate limit of operating systems for the length of a path.
+# Longest path, about the limit of operating systems.
 MAX_PATH = 4096
 
 # Offset of a probe in the paper (eq. 5).
