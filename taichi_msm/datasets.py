@@ -1,14 +1,13 @@
 """Data sets of sweeps for PyTorch.
 
-`Pairs` and `Clips` are map-style data sets of NumPy arrays, of which PyTorch's `DataLoader` makes batches of tensors:
+`Pairs` and `Clips` are map-style data sets of NumPy arrays. PyTorch's `DataLoader` collates them to tensors:
 
     pairs = Pairs("output/tracking", "train")
     for batch in pairs.loader(batch_size=4, shuffle=True, num_workers=2):
         flow, valid = batch["flow"], batch["valid"]  # (4, 2, height, width), (4, height, width)
 
-Pixels are counted to the right and down from the picture's upper left corner, so that the centre of the first pixel is
-at (0.5, 0.5); `grid_sample` with `align_corners=False` takes them as 2 x / width - 1, 2 y / height - 1. Where flow is
-unknown, `valid` is False and the flow is 0.
+Pixel coordinates (x right, y down) have their origin at the picture's upper left corner: the centre of the first pixel
+is (0.5, 0.5). For `grid_sample` with `align_corners=False`, convert them to 2 x / width - 1, 2 y / height - 1.
 
 PyTorch is imported by `loader` only.
 """
@@ -32,23 +31,23 @@ class Pair(TypedDict):
     """Two successive frames, and the labels of the first."""
 
     first: NDArray[np.uint8]  # RGB, shape (3, height, width)
-    second: NDArray[np.uint8]  # of the same shape
-    flow: NDArray[np.float32]  # displacement to the right and down [px], shape (2, height, width)
-    valid: NDArray[np.bool_]  # whether flow is known, which is on tissue; shape (height, width)
+    second: NDArray[np.uint8]  # RGB, shape (3, height, width)
+    flow: NDArray[np.float32]  # displacement (x right, y down) [px], shape (2, height, width); 0 where unknown
+    valid: NDArray[np.bool_]  # whether flow is known: True on tissue; shape (height, width)
     occluded: NDArray[np.bool_]  # tissue hidden or outside the picture in the second frame; shape (height, width)
     depth: NDArray[np.float32]  # along the viewing direction [m], 0 on the background; shape (height, width)
 
 
 class Clip(TypedDict):
-    """Successive frames, and the tracks through them."""
+    """Successive frames, with tracks of material points."""
 
     video: NDArray[np.uint8]  # RGB, shape (frames, 3, height, width)
-    points: NDArray[np.float32]  # projected material points [px], shape (points, frames, 2); 0 behind the eye
+    points: NDArray[np.float32]  # projected material points [px], shape (points, frames, 2); 0 behind the camera
     visible: NDArray[np.bool_]  # shape (points, frames)
 
 
 class _Split:
-    """Runs of a split of a data set, cut into items of `length` frames that begin every `stride` frames."""
+    """Base class: the runs of a split, cut into windows of `length` frames, one every `stride` frames."""
 
     outputs: ClassVar[tuple[str, ...]]  # required entries of `output`
 
@@ -59,7 +58,7 @@ class _Split:
         except OSError as error:
             fault = f"{self.directory / 'dataset.json'}: {error.strerror}"
             raise FilesError(f"{fault}; name the folder that `taichi-msm sweep` wrote") from None
-        # Number, folder, split ("part") and varied "values" of each run.
+        # Run number, folder, split ("part") and varied "values" of each run.
         self.runs: list[dict[str, Any]] = [run for run in content["runs"] if run["part"] == split]
         if not self.runs:
             splits = ", ".join(sorted({run["part"] for run in content["runs"]})) or "none, as no run is complete"
@@ -69,16 +68,16 @@ class _Split:
             remedy = f"run the sweep with set: {{output: [{', '.join(self.outputs)}]}}"
             raise ArgumentError(f"directory: {self.directory / camera} has no {', '.join(missing)}; {remedy}")
         self._size, self._length, self._stride = content["size"], length, stride
-        self._items = max(0, (content["frames"] - length) // stride + 1)  # of a run
+        self._windows = max(0, (content["frames"] - length) // stride + 1)  # windows per run
 
     def __len__(self) -> int:
-        return len(self.runs) * self._items
+        return len(self.runs) * self._windows
 
     def loader(self, **options: Any) -> Any:
         """Return a `torch.utils.data.DataLoader` of this data set.
 
         Args:
-            **options: arguments of the loader, such as batch_size, shuffle and num_workers.
+            **options: keyword arguments of `DataLoader`, such as batch_size, shuffle and num_workers.
 
         Raises:
             NotInstalledError: when PyTorch is not installed.
@@ -90,22 +89,22 @@ class _Split:
         return DataLoader(self, **options)
 
     def _find(self, index: int) -> tuple[Path, int]:
-        """Return the folder of the camera in the run of an item, and the item's first frame."""
-        run, item = divmod(range(len(self))[index], self._items)
-        return self.directory / self.runs[run]["folder"] / self._camera, item * self._stride
+        """Return folder and first frame of a window: its run, and the camera in it."""
+        run, window = divmod(range(len(self))[index], self._windows)
+        return self.directory / self.runs[run]["folder"] / self._camera, window * self._stride
 
 
 class Pairs(_Split):
-    """All pairs of successive frames of a split of a data set.
+    """Data set of all pairs of successive frames of a split.
 
     Args:
-        directory: of the sweep.
+        directory: folder of the sweep.
         split: train, val or test.
-        camera: name of the camera, of a scene with several.
+        camera: name of the camera; "" for a scene with a single one.
 
     Raises:
         ArgumentError: when the split has no runs, or the runs lack outputs.
-        FilesError: when the directory has no data set.
+        FilesError: when dataset.json cannot be read.
     """
 
     outputs = ("png", "flow", "occlusion", "depth")
@@ -115,25 +114,25 @@ class Pairs(_Split):
 
     def __getitem__(self, index: int) -> Pair:
         folder, frame = self._find(index)
-        width, height = self.runs[index // self._items].get("size", self._size)
+        width, height = self.runs[index // self._windows].get("size", self._size)
         flow = read_flo(folder / OUTPUTS["flow"].path(frame), (width, height)).transpose(2, 0, 1)
-        valid = np.abs(flow).max(axis=0) < 1e9  # The magnitude of unknown flow in a file is larger [px].
+        valid = np.abs(flow).max(axis=0) < 1e9  # Files mark unknown flow by 1e10 px.
         return {
-            "first": _pixels(folder, "png", frame).transpose(2, 0, 1),
-            "second": _pixels(folder, "png", frame + 1).transpose(2, 0, 1),
+            "first": _read_image(folder, "png", frame).transpose(2, 0, 1),
+            "second": _read_image(folder, "png", frame + 1).transpose(2, 0, 1),
             "flow": np.where(valid, flow, np.float32(0)),
             "valid": valid,
-            "occluded": _pixels(folder, "occlusion", frame) > 0,
-            "depth": _pixels(folder, "depth", frame),
+            "occluded": _read_image(folder, "occlusion", frame) > 0,
+            "depth": _read_image(folder, "depth", frame),
         }
 
 
 class Clips(_Split):
-    """Successive clips of a split of a data set.
+    """Data set of all clips of a split, without overlap.
 
     Args:
         directory, split, camera: as for `Pairs`.
-        frames: number of frames of a clip.
+        frames: frames per clip.
 
     Raises:
         ArgumentError, FilesError: as for `Pairs`.
@@ -150,12 +149,12 @@ class Clips(_Split):
         with np.load(folder / OUTPUTS["tracks"].path()) as tracks:
             points, occluded = (tracks[name][:, frames] for name in ("points", "occluded"))
         return {
-            "video": np.stack([_pixels(folder, "png", frame).transpose(2, 0, 1) for frame in frames]),
+            "video": np.stack([_read_image(folder, "png", frame).transpose(2, 0, 1) for frame in frames]),
             "points": np.nan_to_num(points),
             "visible": ~occluded,
         }
 
 
-def _pixels(folder: Path, output: str, frame: int) -> NDArray[Any]:
+def _read_image(folder: Path, output: str, frame: int) -> NDArray[Any]:
     with Image.open(folder / OUTPUTS[output].path(frame)) as image:
         return np.array(image)

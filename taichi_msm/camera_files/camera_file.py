@@ -1,4 +1,4 @@
-"""Text file of a camera, and the parser of YAML, JSON, XML and ini files."""
+"""Text file with a calibration or trajectory, and a parser of YAML, JSON, XML and ini."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ LENGTH_UNITS = {"m": 1.0, "mm": 1e-3}
 # Largest depth of nested values. Matrices are nested two or three deep.
 MAX_DEPTH = 20
 
-# Comments and empty lines; a section of an ini file after them; OpenCV's directive, which is not valid YAML.
+# Comments and empty lines; after them the first section of an ini file, or OpenCV's directive, which is not valid YAML.
 _COMMENTS = r"((?:[ \t]*(?:[#;][^\n]*)?\r?\n)*)"
 _INI = re.compile(_COMMENTS + r"[ \t]*\[[^\]\n=,]*\][ \t]*\r?\n" + _COMMENTS + r"[^\n]*=")
 _DIRECTIVE = re.compile(_COMMENTS + r"%YAML[^\n]*")
@@ -35,11 +35,11 @@ _PARSER_ERRORS = (
 
 
 class Entries(dict[str, Any]):
-    """Keys and values of a file or of a section of it.
+    """Keys and values of a file, or of one of its sections.
 
     Args:
         values: values by keys.
-        lines: number of the line of each key, counted from 1; empty for JSON and XML, whose parsers drop it.
+        lines: line numbers by keys, from 1; empty for JSON and XML, whose parsers have no lines.
     """
 
     def __init__(self, values: Mapping[str, Any], lines: Mapping[str, int]) -> None:
@@ -48,7 +48,7 @@ class Entries(dict[str, Any]):
 
 
 class CameraFileError(Exception):
-    """The file cannot be used; the message contains its name, the line where it is known, the reason and the remedy."""
+    """Unusable file; the message has its name, the line if known, the reason and the remedy."""
 
 
 class _ContentError(Exception):
@@ -60,7 +60,7 @@ class _ContentError(Exception):
 
 
 class CameraFile:
-    """A text file of a camera.
+    """Text file with a calibration or a trajectory of a camera.
 
     Args:
         path: path of the file.
@@ -97,10 +97,10 @@ class CameraFile:
         except _PARSER_ERRORS as error:
             mark = getattr(error, "problem_mark", None)
             line = mark.line + 1 if mark else getattr(error, "lineno", None)
-            raise self.fault("neither YAML, XML, JSON nor an ini file; name a calibration", line) from None
+            raise self.fault("neither YAML, XML, JSON nor ini; name a calibration file", line) from None
         if not isinstance(data, Entries):
             content = "a list" if isinstance(data, list) else "no keys"
-            raise self.fault(f"has {content}; expected camera_matrix and distortion_coefficients as keys")
+            raise self.fault(f"contains {content}; expected the keys camera_matrix and distortion_coefficients")
         return data
 
 
@@ -153,10 +153,10 @@ def _json(text: str) -> Any:
     try:
         return json.loads(text, object_pairs_hook=lambda pairs: _entries((*pair, None) for pair in pairs))
     except json.JSONDecodeError as error:
-        # At the end of the text, or within its last word, or in a string that is not closed.
+        # The fault is at the end of the text, in its last word, or in an unclosed string.
         if error.msg.startswith("Unterminated") or re.fullmatch(r"[\w.+\\-]*\s*", text[error.pos :]):
             raise _truncated(text, "JSON") from None
-        place = f"not JSON from column {error.colno} on"
+        place = f"invalid JSON from column {error.colno} on"
         raise _ContentError(f"{place}; correct it, or export the calibration again", error.lineno) from None
 
 
@@ -188,7 +188,7 @@ _Loader.add_constructor("tag:yaml.org,2002:python/tuple", lambda loader, node: l
 def _yaml(text: str) -> Any:
     """Parse YAML, also with OpenCV's directive in the first line, which is not valid YAML."""
     text = _DIRECTIVE.sub(r"\1", text, count=1)
-    # Nested aliases, deep nesting and very many values would take unlimited time, and no calibration has them.
+    # Nested aliases, deep nesting and huge files take unlimited time; no calibration has them.
     depth, max_events = 0, 200_000
     try:
         for count, event in enumerate(yaml.parse(text, _BaseLoader)):
@@ -223,7 +223,7 @@ def _xml(text: str) -> Entries:
     except ElementTree.ParseError as error:
         if messages[error.code] in (XML_ERROR_NO_ELEMENTS, XML_ERROR_UNCLOSED_TOKEN):
             raise _truncated(text, "XML") from None
-        fault = f"not XML from column {error.position[1] + 1} on; correct it, or export the calibration again"
+        fault = f"invalid XML from column {error.position[1] + 1} on; correct it, or export the calibration again"
         raise _ContentError(fault, error.position[0]) from None
     items: list[tuple[str, Any, None]] = []
     for element in root:

@@ -1,4 +1,4 @@
-"""camera.json of a run, with the lens and the matrix in OpenCV's pixels."""
+"""camera.json, the calibration in the results of a run."""
 
 from __future__ import annotations
 
@@ -14,12 +14,12 @@ KEYS = {"size", "projection", "calibration", "model", "distortion"}
 
 
 def _cameras(file: CameraFile) -> Sequence[Keys]:
-    """Return the only camera."""
+    """Return the keys of the camera; an empty list for another format."""
     return [Keys(file, file.data)] if file.data.keys() >= KEYS else []
 
 
 def _read(keys: Keys) -> Calibration:
-    """Read `calibration`, not `intrinsics`, whose first pixel has its centre at (0.5, 0.5)."""
+    """Read `calibration`, in OpenCV's pixel coordinates; `intrinsics` has the first pixel centre at (0.5, 0.5)."""
     model = keys.data["model"]
     if model not in MODELS:
         fault = f"model: {truncate(str(model))} is not supported; expected one of: {', '.join(MODELS)}"

@@ -34,7 +34,7 @@ MODELS = {
 
 
 def _cameras(file: CameraFile) -> Sequence[Keys]:
-    """Return the only camera, with OpenCV's keys; COLMAP's first pixel has its centre at (0.5, 0.5)."""
+    """Return the camera under OpenCV's keys, shifted by half a pixel: COLMAP's first pixel centre is (0.5, 0.5)."""
     cameras = list(CAMERA.finditer(file.text))
     lines = [1 + file.text.count("\n", 0, camera.start()) for camera in cameras]
     for camera, line in zip(cameras, lines, strict=True):
@@ -46,7 +46,7 @@ def _cameras(file: CameraFile) -> Sequence[Keys]:
 
 def _camera(file: CameraFile, line: int, name: str, width: str, height: str, parameters: str) -> Keys:
     if name not in MODELS:
-        raise file.fault(f"{name}: a model that is not supported; expected one of: {', '.join(MODELS)}", line)
+        raise file.fault(f"{name}: not a supported model; expected one of: {', '.join(MODELS)}", line)
     focal_count, model, coefficient_count = MODELS[name]
     count, lines = focal_count + 2 + coefficient_count, {"PARAMS": line}
     numbers = Keys(file, {"PARAMS": parameters}, lines=lines).require("params", count, name)
@@ -58,7 +58,7 @@ def _camera(file: CameraFile, line: int, name: str, width: str, height: str, par
 
 
 def _read_images(file: CameraFile) -> Trajectory | None:
-    """Read the images, in the order of the numbers at the end of their names, or else of their names."""
+    """Read the poses, ordered by times or final numbers in the image names, else by name; None for another format."""
     lines = [(n, line) for n, line in enumerate(file.text.splitlines(), 1) if line.strip() and line[0] != "#"]
     if not lines or _image(lines[0][1]) is None:
         return None
@@ -69,12 +69,15 @@ def _read_images(file: CameraFile) -> Trajectory | None:
         if (match := _image(line)) is not None:
             images.append((match[4], n, [float(word) for word in match[2].split()], match[3]))
         elif not (follows_image and _has_points(line.split())):
-            raise file.fault("neither IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME nor its line of points", n)
+            raise file.fault(
+                "neither an image, IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME, nor points; export the model again",
+                n,
+            )
         follows_image = match is not None
     if len(cameras := {camera for *_, camera in images}) > 1:
         raise file.fault(f"has images of cameras {listed(sorted(cameras))}; keep those of one")
     stems = [name.rpartition(".")[0] or name for name, *_ in images]
-    # Such as 1305031102.975304.png.
+    # Times as names, such as 1305031102.975304.png.
     times = [float(match[1]) for stem in stems if (match := re.fullmatch(r"(?:.*\D)??(\d+\.\d+)", stem))]
     has_times = len({*times}) == len(images)
     ends = [re.search(r"(\d+)\D*$", stem) for stem in stems]
@@ -92,7 +95,7 @@ def _read_images(file: CameraFile) -> Trajectory | None:
 
 
 def _image(line: str) -> re.Match[str] | None:
-    """Match the line of an image; the last word of a line of points is a number."""
+    """Match the line of an image, which, unlike a line of points, does not end with a number."""
     return None if parse_numbers(line.split()[-1:]) else IMAGE.match(line)
 
 

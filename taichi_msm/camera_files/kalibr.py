@@ -1,6 +1,6 @@
-"""Kalibr's camchain: a section per camera, each but the first with the pose after the one before it.
+"""Kalibr's camchain: a section per camera, with its pose relative to the previous camera.
 
-The sensor.yaml of EuRoC has the keys of a section.
+EuRoC's sensor.yaml has the keys of one section.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ INTRINSICS = {"pinhole": 4, "omni": 5}
 
 
 def _cameras(file: CameraFile) -> Sequence[Keys]:
-    """Return the sections of the cameras by their numbers."""
+    """Return the keys of the cameras in the order of their numbers; an empty list for another format."""
     if _is_camera(file.data):
         return [_camera(file, "", file.data)]
     names = [name for name, section in file.data.items() if _is_camera(section)]
@@ -28,7 +28,7 @@ def _cameras(file: CameraFile) -> Sequence[Keys]:
 
 
 def _pose(keys: Keys) -> StereoPose | None:
-    """Read T_cn_cnm1, four rows [R, t]."""
+    """Read T_cn_cnm1, the matrix [R, t] from the previous camera to this one, shape (4, 4)."""
     if "T_cn_cnm1" not in keys.data:
         return None
     rows = keys.require("tcncnm1", 16, "T_cn_cnm1")
@@ -36,7 +36,7 @@ def _pose(keys: Keys) -> StereoPose | None:
 
 
 def _is_camera(section: Any) -> TypeGuard[Entries]:
-    """Return whether a section has a model and its numbers; nine of them would be a matrix."""
+    """Return whether a section has a model and a list of intrinsics; nine numbers are a matrix of another format."""
     return (
         isinstance(section, Entries)
         and "camera_model" in section
@@ -45,13 +45,13 @@ def _is_camera(section: Any) -> TypeGuard[Entries]:
 
 
 def _camera(file: CameraFile, prefix: str, section: Entries) -> Keys:
-    """Return a section with a matrix in place of the intrinsics, which of `omni` begin with xi."""
+    """Return the keys of a section, with intrinsics (xi of `omni`, fx, fy, cx, cy) converted to a camera matrix."""
     numbers, model = flat(section["intrinsics"]), str(section["camera_model"]).lower()
     if model not in INTRINSICS:
         fault = f"{prefix}camera_model: {truncate(model)} is not supported; found {listed(section)}"
         raise file.fault(f"{fault}; expected one of: {', '.join(INTRINSICS)}", section.lines.get("camera_model"))
     if len(numbers) != INTRINSICS[model]:
-        fault = f"{prefix}intrinsics: {len(numbers)} numbers, where {INTRINSICS[model]} belong to {model}"
+        fault = f"{prefix}intrinsics: {len(numbers)} numbers, but {model} has {INTRINSICS[model]}"
         raise file.fault(f"{fault}; write {INTRINSICS[model]} numbers", section.lines.get("intrinsics"))
     *xi, fx, fy, cx, cy = numbers
     data = {**section, "intrinsics": [fx, 0, cx, 0, fy, cy, 0, 0, 1], **({"xi": xi} if xi else {})}

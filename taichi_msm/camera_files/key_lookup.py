@@ -24,8 +24,8 @@ class Keys:
     Args:
         file: file of the calibration.
         data: values by their names in the file.
-        folded: names as `fold` reduces them, without a mark of the camera, by those in the file; None for `fold`.
-        lines: lines of the names in the file, for messages; None for those of `data`.
+        folded: spellings without the mark of the camera (left, 1, ...), by names in the file; None for `fold` of each.
+        lines: line numbers by names in the file, for messages; None for those of `data`.
     """
 
     def __init__(
@@ -49,12 +49,12 @@ class Keys:
 
         Args:
             fault: reason and remedy.
-            name: key, whose line is named; None for a fault of the file.
+            name: key at fault, whose line is in the message; None for the file as a whole.
         """
         return self.file.fault(fault, None if name is None else self.lines.get(name))
 
     def values(self, spelling: str, kind: type = object) -> dict[str, Any]:
-        """Return the values that are not empty of the keys with a spelling, by names.
+        """Return the non-empty values of the keys that match a spelling, by name in the file.
 
         Args:
             spelling: pattern of the folded name.
@@ -66,7 +66,7 @@ class Keys:
         return {name: value for name, value in matches.items() if value is not None and value != ""}
 
     def find(self, spelling: str) -> str | None:
-        """Return the first name with a spelling, or None."""
+        """Return the first name in the file that matches a spelling, or None."""
         return next(iter(self.values(spelling)), None)
 
     def numbers(self, spelling: str) -> list[float] | None:
@@ -78,7 +78,7 @@ class Keys:
         for name, values in others:
             pairs = zip_longest(numbers, values, fillvalue=0.0)
             if not all(math.isclose(a, b, rel_tol=ROUNDING_TOLERANCE) for a, b in pairs):
-                raise self.fault(f"{first} and {name} are not the same; keep the right one", name)
+                raise self.fault(f"{first} and {name} differ; keep the right one", name)
         return numbers
 
     def require(self, spelling: str, count: int, name: str) -> list[float]:
@@ -86,22 +86,22 @@ class Keys:
 
         Args:
             spelling: pattern of the folded name.
-            count: number of numbers.
+            count: length of the list.
             name: name of the key for messages.
 
         Raises:
-            CameraFileError: when the key is missing or has another number of numbers.
+            CameraFileError: when the key is missing or its list has another length.
         """
         numbers = self.numbers(spelling)
         if numbers is None:
             raise self.file.fault(f"has no {name}; found {self}; add it")
         if len(numbers) != count:
-            fault = f"{name}: {len(numbers)} numbers, where {count} belong"
+            fault = f"{name}: {len(numbers)} numbers in place of {count}"
             raise self.fault(f"{fault}; found {self}; write {count} numbers", self.find(spelling))
         return numbers
 
     def unread(self, spelling: str) -> list[str]:
-        """Return the names of keys that match a spelling and were not looked up, except of empty values and zeros."""
+        """Return the names that match a spelling, were never looked up, and have a value other than 0."""
         names = [name for name in self.data if name not in self._read_names]
         return [name for name in names if re.fullmatch(spelling, self.folded[name]) and any(flat(self.data[name]))]
 
@@ -118,7 +118,7 @@ class Keys:
             raise self.fault(f"{name}: {fault}; write it as OpenCV does", name)
         rows, cols = (value.get(side) if isinstance(value, dict) else None for side in ("rows", "cols"))
         if isinstance(rows, int) and isinstance(cols, int) and rows * cols != len(numbers):
-            fault = f"has {len(numbers)} numbers, and {rows} rows of {cols}; write {rows * cols} numbers"
+            fault = f"{len(numbers)} numbers for {rows} rows of {cols}; write {rows * cols} numbers"
             raise self.fault(f"{name}: {fault}", name)
         return numbers
 

@@ -1,4 +1,4 @@
-"""KITTI's trajectories: the first three rows of the matrix from the camera to the world in a line, without times."""
+"""KITTI's trajectories: a line per pose, three rows of the matrix from the camera to the world; no times."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ COUNT = 12
 
 
 def _read(file: CameraFile) -> Trajectory | None:
-    """Read the matrices, if the first line has twelve numbers."""
+    """Read the matrices; None for another format, unless the first line has twelve numbers."""
     lines = [(n, line.split()) for n, line in enumerate(file.text.splitlines(), 1)]
     lines = [(n, words) for n, words in lines if words and not words[0].startswith("#")]
     if not lines or len(lines[0][1]) != COUNT or parse_numbers(lines[0][1]) is None:
@@ -21,7 +21,7 @@ def _read(file: CameraFile) -> Trajectory | None:
     for n, words in lines:
         numbers = parse_numbers(words)
         if numbers is None or len(numbers) != COUNT:
-            raise file.fault("not twelve numbers as before; write a file of one format", n)
+            raise file.fault("not twelve numbers, as in the first line; write twelve in each line", n)
         matrix = np.array(numbers).reshape(3, 4)
         rotation = matrix[:, :3]
         if abs(rotation @ rotation.T - np.eye(3)).max() > NORM_TOLERANCE or np.linalg.det(rotation) < 0:

@@ -9,13 +9,13 @@ from taichi_msm.camera_files.camera_file import CameraFile
 from taichi_msm.camera_files.key_lookup import Keys
 from taichi_msm.lenses import MODELS
 
-# Lines that are neither empty nor comments, in their order, each with its number of values.
+# Lines with values, in their order, each with the number of values; None for any number.
 LINES = {"polynomial": None, "inverse": None, "centre": 2, "affine": 3, "size": 2}
 DEGREE = 4
 
 
 def _cameras(file: CameraFile) -> Sequence[Keys]:
-    """Return the only camera, if the file begins with that comment."""
+    """Return the keys of the camera, if the file begins with the comment of OCamCalib."""
     if not file.text.lstrip().startswith("#polynomial coefficients"):
         return ()
     lines = [(n, line.strip()) for n, line in enumerate(file.text.splitlines(), 1)]
@@ -28,8 +28,8 @@ def _cameras(file: CameraFile) -> Sequence[Keys]:
 def _read(keys: Keys) -> Calibration:
     """Read the lines.
 
-    The pixel in row c u + d v and column e u + v from the centre sees along u down, v to the right, f(p) backward.
-    With the axes exchanged, and lengths multiplied by c, this is the formula of the lens.
+    The pixel at row c u + d v, column e u + v from the centre views the direction u down, v right, f(rho) backward,
+    rho^2 = u^2 + v^2. Exchanging u and v and multiplying lengths by c gives the formula of the lens `scaramuzza`.
     """
     (row, column), (c, d, e), (height, width) = (keys.require(name, n, name) for name, n in LINES.items() if n)
     count, *polynomial = keys.numbers("polynomial") or [0.0]

@@ -1,6 +1,6 @@
-"""Calibrations by OpenCV (YAML, XML, JSON) and ROS (camera_info), of one camera, in the spellings of many scripts.
+"""Calibrations of one camera by OpenCV (YAML, XML, JSON) and ROS (camera_info), with keys as many scripts spell them.
 
-Other formats are converted to these keys.
+The readers of other formats convert to these keys.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ FISHEYE = r"(is|use)?fisheye(model)?"
 ROTATION = r"r|rot|rotation|rmat|(rot|rotation)(mat|matrix)"
 TRANSLATION = r"t|tvec|trans|translation|(trans|translation)(vec|vector)"
 
-# Keys that are not read but change the projection, unless they are empty or 0.
+# Unsupported keys that could change the projection: an error unless empty or 0.
 UNSUPPORTED = (
     r".*(distort(?!ed)|distorsion|coef|radial|tangential|prism|fisheye|omni|mirror|polynom|skew).*|kc|[kps][1-6]|"
     rf"(?!new|opt).*(cameramat|intrinsic).*|{_PICTURE}?(shape|dimensions?)|"
@@ -41,7 +41,7 @@ UNSUPPORTED = (
     r"binning|scale(factor)?|undistort(ed)?|rectified|roi|crop(ped|[xywh])?|offset[xy]|alphac|tau[xy]?|tilt.*|calibration"
 )
 
-# Lens models by their names in files; empty for names of several models.
+# Lens models by their names in files; empty for ambiguous names.
 NO_DISTORTION = "none"
 LENSES = {
     **dict.fromkeys(("pinhole", "perspective", "mono", "monocular"), ""),
@@ -78,7 +78,7 @@ def read_camera(keys: Keys) -> Calibration:
     if size and (fault := focal_fault((fx, fy), size)):
         raise keys.fault(f"{name}: {fault}", name)
     if names := keys.unread(UNSUPPORTED):
-        fault = f"{listed(names)}: not understood, and may change the picture"
+        fault = f"{listed(names)}: unknown, and may change the projection"
         raise keys.fault(f"{fault}; found {keys}; {_REMEDY}, or remove the keys that do not matter", names[0])
     model, values = ("pinhole", []) if model == NO_DISTORTION else (model, values or [])
     lens = _coefficients(keys, model, [*xi, *values] if model == "omnidir" else values)
@@ -86,7 +86,7 @@ def read_camera(keys: Keys) -> Calibration:
 
 
 def read_pose(keys: Keys) -> StereoPose | None:
-    """Read R and T, which have no mark; R1 and R2 would be rotations of the rectification."""
+    """Read R and T, keys without the mark of a camera (R1 and R2 belong to a rectification); None without both."""
     unmarked = {name: value for name, value in keys.data.items() if keys.folded[name] == fold(name)}
     shared = Keys(keys.file, unmarked, lines=keys.lines)
     if not shared.values(ROTATION) and not shared.values(TRANSLATION):
@@ -106,7 +106,7 @@ def _require_agreement(keys: Keys, focal: Sequence[float], centre: Sequence[floa
             math.isclose(a, b, rel_tol=ROUNDING_TOLERANCE) for a, b in zip(numbers, values, strict=False)
         ):
             names, found = listed(keys.values(spelling)), ", ".join(f"{number:g}" for number in numbers)
-            raise keys.fault(f"{names}: {found}, and the camera matrix has others; keep one", keys.find(spelling))
+            raise keys.fault(f"{names}: {found}, unlike the camera matrix; keep one", keys.find(spelling))
 
 
 def _model(keys: Keys, values: Sequence[float], *, has_xi: bool) -> str:
@@ -116,7 +116,7 @@ def _model(keys: Keys, values: Sequence[float], *, has_xi: bool) -> str:
         model = LENSES.get(fold(value))
         if model is None:
             if re.fullmatch(LENS_OR_DEVICE, keys.folded[name]):
-                continue  # The name of a device.
+                continue  # A type of device, not of lens.
             known = "plumb_bob, radtan, rational_polynomial, equidistant, fisheye, omnidir, none"
             raise keys.fault(f"{name}: {truncate(str(value))} is not supported; expected one of: {known}", name)
         if model == NO_DISTORTION and any(values):
@@ -129,7 +129,7 @@ def _model(keys: Keys, values: Sequence[float], *, has_xi: bool) -> str:
             raise keys.fault(f"{name}: {truncate(str(value))} is neither true nor false; write one of them", name)
         sources[FLAGS[flag]] = name
     if {"omnidir", NO_DISTORTION} & sources.keys():
-        sources.pop("pinhole", None)  # As its distortion, or none of it.
+        sources.pop("pinhole", None)  # Files of these may name pinhole as well.
     if len(sources) > 1:
         (model, name), (model_2, name_2), *_ = sources.items()
         raise keys.fault(f"{name} is {model}, {name_2} is {model_2}; keep the right one", name_2)
@@ -143,7 +143,7 @@ def _coefficients(keys: Keys, model: str, values: Sequence[float]) -> dict[str, 
         expected = "4, 5, 8, 12 or 14: k1, k2, p1, p2, k3, ..." if model == "pinhole" else f"those of {model}: "
         expected += "" if model == "pinhole" else ", ".join(names)
         raise keys.fault(f"{len(values)} distortion coefficients; expected {expected}", keys.find(COEFFICIENTS))
-    # OpenCV's coefficients after k6.
+    # Thin prism and tilt, which follow k6.
     if any(values[8:]):
         number = next(n for n, value in enumerate(values, 1) if n > 8 and value)
         fault = f"distortion coefficient {number} is not 0"
@@ -173,8 +173,8 @@ def _size(keys: Keys) -> tuple[int, int] | None:
         if is_narrower or any(region.get(offset) for offset in ("x_offset", "y_offset")):
             faults.append(name)
     if faults:
-        fault = f"{listed(faults)}: binned or cropped pictures, and a camera matrix of full ones"
-        remedy = "write that of the pictures, without binning_x, binning_y and roi"
+        fault = f"{listed(faults)}: pictures are binned or cropped, and the camera matrix is that of full pictures"
+        remedy = "write the matrix of the binned or cropped ones, and remove binning_x, binning_y and roi"
         raise keys.fault(f"{fault}; {remedy}", faults[0])
     return size
 

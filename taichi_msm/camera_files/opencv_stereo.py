@@ -1,4 +1,4 @@
-"""Stereo pairs with a key or section per camera, as of OpenCV's stereoCalibrate, SCARED and STIR."""
+"""Calibrations of stereo pairs, with keys or a section per camera: OpenCV's stereoCalibrate, SCARED, STIR."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from taichi_msm.camera_files.camera_file import CameraFile, Entries, listed
 from taichi_msm.camera_files.key_lookup import Keys, flat, fold
 from taichi_msm.camera_files.opencv import MATRIX, read_camera, read_pose
 
-# Marks of the left and the right camera, around the name of a key or as that of a section.
+# Marks of the left and the right camera, before or after the name of a key; or names of their sections.
 MARKS = (
     (r"(.+?)_?1|cam(?:era)?_?1_(.+)", r"(.+?)_?2|cam(?:era)?_?2_(.+)"),
     (r"(?i:left)_?(.+)|(.+?)_?(?i:left)", r"(?i:right)_?(.+)|(.+?)_?(?i:right)"),
@@ -21,28 +21,28 @@ MARKS = (
 
 
 def _cameras(file: CameraFile) -> Sequence[Keys]:
-    """Return the keys of each camera, if both have a matrix, with those that have no mark."""
-    data = _without_sections(file.data)
+    """Return the keys of each camera and those without a mark; an empty list unless both cameras have a matrix."""
+    data = _flatten_sections(file.data)
     for marks in MARKS:
-        eyes = [_marked(data, mark) for mark in marks]
-        matrices = [[key for key, name in eye.items() if re.fullmatch(MATRIX, name)] for eye in eyes]
+        sides = [_strip_mark(data, mark) for mark in marks]
+        matrices = [[key for key, name in side.items() if re.fullmatch(MATRIX, name)] for side in sides]
         if all(any(len(flat(data[key])) == 9 for key in keys) for keys in matrices):
-            shared = {key: fold(key) for key in data if not any(key in eye for eye in eyes)}
-            folded = [{**shared, **eye} for eye in eyes]
-            return [Keys(file, {key: data[key] for key in names}, names, data.lines) for names in folded]
+            unmarked = {key: fold(key) for key in data if not any(key in side for side in sides)}
+            names_by_key = [{**unmarked, **side} for side in sides]
+            return [Keys(file, {key: data[key] for key in names}, names, data.lines) for names in names_by_key]
     return ()
 
 
 def _pose(keys: Keys) -> StereoPose | None:
-    """Read R and T; other keys must not contradict their unit or pose."""
+    """Read R and T. Keys that could state another unit or pose are an error."""
     if names := keys.unread(r"units?|[rt]c?m+|rt|extrinsics?"):
         fault = f"{listed(names)}: not understood; write R, 3 x 3, and T, 3 numbers"
         raise keys.fault(f"{fault}, in metres, or set calibration_unit: mm, and remove these", names[0])
     return read_pose(keys)
 
 
-def _without_sections(data: Entries) -> Entries:
-    """Return the keys, those of sections after the name of the section, as left_K."""
+def _flatten_sections(data: Entries) -> Entries:
+    """Rename the keys of sections: K of the section left becomes left_K."""
     flattened: dict[str, Any] = {}
     lines: dict[str, int] = {}
     for key, value in data.items():
@@ -55,8 +55,8 @@ def _without_sections(data: Entries) -> Entries:
     return Entries(flattened, lines)
 
 
-def _marked(keys: Iterable[str], mark: str) -> dict[str, str]:
-    """Return the keys that have a mark, each with its folded name without it."""
+def _strip_mark(keys: Iterable[str], mark: str) -> dict[str, str]:
+    """Return the keys that have a mark; folded names without the mark, by key."""
     matches = {key: re.fullmatch(mark, str(key)) for key in keys}
     return {key: fold("".join(filter(None, match.groups()))) for key, match in matches.items() if match}
 

@@ -1,4 +1,4 @@
-"""Reading of calibrations and trajectories, and the tables of their readers."""
+"""Calibrations and trajectories of other programs: functions to read them, and the tables of readers."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from taichi_msm.camera_files.stereomis import STEREOMIS
 from taichi_msm.camera_files.trajectory import Trajectory, TrajectoryReader, pose_fault
 from taichi_msm.camera_files.tum_euroc import TABLES
 
-# The first one that recognises a file reads it.
+# The first reader that recognises a file reads it.
 CALIBRATION_READERS = (OCAMCALIB, COLMAP_CAMERAS, STEREOMIS, KALIBR, CAMERA_JSON, STEREO, OPENCV)
 TRAJECTORY_READERS: tuple[TrajectoryReader, ...] = (COLMAP_IMAGES, KITTI, TABLES)
 
@@ -38,8 +38,8 @@ def read_calibration(
 
     Args:
         path: path of the file.
-        eye: camera of a stereo pair; of the right one the pose is read as well.
-        unit: unit of lengths in the file; None for that of the format, or for metres where the format has none.
+        eye: camera of a stereo pair; right includes its pose.
+        unit: unit of lengths in the file; None for that of the format, else metres.
 
     Returns:
         The calibration, lengths in metres.
@@ -57,10 +57,10 @@ def read_calibration(
     calibration, pose = reader.read(cameras[1]), reader.pose(cameras[1])
     if pose is None:
         return calibration
-    # Cameras of a pair in metres are closer than half a metre; in millimetres, further apart than 0.5 mm.
+    # Baselines are 0.5 mm to 0.5 m, so a larger number than 0.5 is probably in millimetres.
     if unit is None and reader.unit is None and max(map(abs, pose.translation)) > 0.5:
         distances = ", ".join(f"{number:g}" for number in pose.translation)
-        raise file.fault(f"the cameras are [{distances}] m apart; set calibration_unit: mm, or m if that is right")
+        raise file.fault(f"T is [{distances}], hardly in metres; set calibration_unit: mm, or m if that is right")
     rotation = np.array(pose.rotation)
     if not ((deviation := np.abs(rotation @ rotation.T - np.eye(3)).max()) <= 1e-3):
         raise file.fault(f"R: R R^T differs from 1 by {deviation:.2g}; write the 3 x 3 numbers of a rotation")
@@ -74,7 +74,7 @@ class PoseKeys(NamedTuple):
 
     poses_unit: str | None = None  # unit of lengths, m or mm
     poses_time: str | None = None  # unit of times, s, ms, us or ns
-    # Time of the scene's beginning: of the file, or, before its first pose, after that one [s].
+    # Time in the file at which the scene begins [s]; below the first time, counted from the first pose.
     poses_start: float | None = None
     poses_rate: float | None = None  # poses per second of a file without times
 
@@ -92,11 +92,11 @@ def read_poses(path: str, keys: PoseKeys = PoseKeys()) -> tuple[tuple[float, ...
     Raises:
         CameraFileError: when the file is invalid or not supported; the message contains the line.
     """
-    file = CameraFile(path, max_bytes=2**27)  # COLMAP's contains the points of every picture
+    file = CameraFile(path, max_bytes=2**27)  # COLMAP's files contain the points of every picture
     trajectory = next(found for reader in TRAJECTORY_READERS if (found := reader.read(file)) is not None)
     if not trajectory.rows:
         raise file.fault("no poses; expected lines t tx ty tz qx qy qz qw")
-    scale = LENGTH_UNITS[_agreed(file, "poses_unit", keys.poses_unit, trajectory.length_unit) or "m"]
+    scale = LENGTH_UNITS[_agreed_unit(file, "poses_unit", keys.poses_unit, trajectory.length_unit) or "m"]
     times = _times(file, trajectory, keys)
     rows: list[tuple[float, ...]] = []
     for n, time, (_, x, y, z, *quaternion) in zip(trajectory.lines, times, trajectory.rows, strict=True):
@@ -108,6 +108,7 @@ def read_poses(path: str, keys: PoseKeys = PoseKeys()) -> tuple[tuple[float, ...
 
 
 def _times(file: CameraFile, trajectory: Trajectory, keys: PoseKeys) -> list[float]:
+    """Return the time of every pose in the scene [s]."""
     numbers = [row[0] for row in trajectory.rows]
     if not trajectory.has_times:
         if keys.poses_time is not None:
@@ -119,8 +120,8 @@ def _times(file: CameraFile, trajectory: Trajectory, keys: PoseKeys) -> list[flo
     else:
         if keys.poses_rate is not None:
             raise file.fault("has times; remove poses_rate")
-        unit = _agreed(file, "poses_time", keys.poses_time, trajectory.time_unit)
-        # In seconds they would be in the year 5138.
+        unit = _agreed_unit(file, "poses_time", keys.poses_time, trajectory.time_unit)
+        # 1e11 s is in the year 5138.
         if unit is None and max(map(abs, numbers)) > 1e11:
             raise file.fault(f"has the time {numbers[0]:.0f}, hardly in seconds; set poses_time: s, ms, us or ns")
         times = [number / TIME_UNITS[unit or "s"] for number in numbers]
@@ -129,14 +130,14 @@ def _times(file: CameraFile, trajectory: Trajectory, keys: PoseKeys) -> list[flo
     if start > times[-1]:
         times_text = f"{times[0]:.15g} s to {times[-1]:.15g} s"
         raise file.fault(f"poses_start: {start:.15g} s is after its poses, at {times_text}; take a time of these")
-    # A time before the first pose counts from it. Differences of large times are rounded to their resolution.
+    # A time before the first pose counts from that pose. Differences of large times are rounded to their resolution.
     is_after_first = start >= times[0] or math.isclose(start, times[0], abs_tol=1e-9)
     origin, digits = start if is_after_first else times[0] + start, int(-math.log10(math.ulp(times[-1])))
     return [round(time - origin, digits) for time in times]
 
 
-def _agreed(file: CameraFile, key: str, value: str | None, found: str | None) -> str | None:
-    """Return the unit that a key of the camera or the file contains, if any does."""
+def _agreed_unit(file: CameraFile, key: str, value: str | None, found: str | None) -> str | None:
+    """Return the unit from a key of the camera or from the header of the file; None without both."""
     if value is not None and found is not None and value != found:
         raise file.fault(f"its header has {found}, and {key} is {value}; keep the right one")
     return value if value is not None else found

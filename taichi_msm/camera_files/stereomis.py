@@ -10,7 +10,7 @@ from taichi_msm.camera_files.camera_file import CameraFile, Entries, listed
 from taichi_msm.camera_files.key_lookup import Keys
 from taichi_msm.camera_files.opencv import read_camera, read_pose
 
-# Keys of a section by those of OpenCV.
+# OpenCV's keys, each with those of a section for it.
 KEYS = {
     "intrinsics": ("fc_x", "fc_y", "cc_x", "cc_y"),
     "D": ("kc_0", "kc_1", "kc_2", "kc_3"),
@@ -38,7 +38,7 @@ def _camera(file: CameraFile, section: Entries, line: int | None) -> Keys:
     known = {*MORE_COEFFICIENTS, *(name for names in KEYS.values() for name in names)}
     others = [name for name in section if name not in known and re.match(r"(kc|fc|cc|res|r|t)_|skew|alpha", name)]
     if others:
-        fault = f"{listed(others)}: not understood; found {listed(section)}"
+        fault = f"{listed(others)}: unknown; found {listed(section)}"
         raise file.fault(f"{fault}; remove the keys that do not matter", section.lines.get(others[0]))
     values["D"] += [section.get(name, "0") for name in MORE_COEFFICIENTS]
     fx, fy, cx, cy = values["intrinsics"]

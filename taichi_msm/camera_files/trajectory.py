@@ -8,7 +8,7 @@ from typing import NamedTuple
 
 from taichi_msm.camera_files.camera_file import CameraFile
 
-# Largest deviation from 1 of the norm of a quaternion, and from 0 of the entries of R R^T - 1.
+# Largest error of the norm of a quaternion, and of the entries of R R^T.
 NORM_TOLERANCE = 1e-3
 
 # Largest number in a trajectory.
@@ -20,13 +20,13 @@ COLUMNS = ("t", "tx", "ty", "tz", "qx", "qy", "qz", "qw")
 class Trajectory(NamedTuple):
     """Poses of a camera, in the units of the file."""
 
-    # Time, position x, y, z and quaternion x, y, z, w, from the camera to the world; without times, the number of the
-    # picture in place of the time.
+    # Time (or the number of the picture, without times), position x, y, z and quaternion x, y, z, w, from the camera to
+    # the world.
     rows: Sequence[Sequence[float]]
     lines: Sequence[int]  # numbers of the lines of the rows, for messages
     has_times: bool  # whether the file contains times
-    time_unit: str | None = None  # unit of the times that the file contains, if it does
-    length_unit: str | None = None  # unit of the lengths that the file contains, if it does
+    time_unit: str | None = None  # unit of times in the header; None without one
+    length_unit: str | None = None  # unit of lengths in the header; None without one
 
 
 class TrajectoryReader(NamedTuple):
@@ -34,8 +34,7 @@ class TrajectoryReader(NamedTuple):
 
     name: str  # name of the format, for users
     recognised_by: str  # content by which a file is recognised, for users
-    # Function that returns the trajectory, or None if the file has another format; it raises a CameraFileError with the
-    # line of a fault.
+    # Function that returns the trajectory, or None for another format; a CameraFileError has the line of a fault.
     read: Callable[[CameraFile], Trajectory | None]
 
 
@@ -56,8 +55,8 @@ def pose_fault(row: Sequence[float], previous: Sequence[float] | None) -> str:
         previous: row before it, for the order of times; None for the first.
     """
     if previous is not None and row[0] <= previous[0]:
-        times = f"is at {row[0]:.15g} s, the pose before it at {previous[0]:.15g} s"
-        return f"{times}; sort them, each later than the last"
+        times = f"is at {row[0]:.15g} s, not after the previous pose at {previous[0]:.15g} s"
+        return f"{times}; sort the poses by time, without equal times"
     if abs(math.hypot(*row[4:]) - 1) > NORM_TOLERANCE:
-        return f"its quaternion has the length {math.hypot(*row[4:]):g}, which is not a rotation; normalise it to 1"
+        return f"its quaternion has norm {math.hypot(*row[4:]):g} and is no rotation; normalise it to 1"
     return ""

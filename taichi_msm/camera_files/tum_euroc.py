@@ -1,4 +1,4 @@
-"""Trajectories in columns: TUM's, t tx ty tz qx qy qz qw, and those of a header, as in EuRoC and TUM-VI."""
+"""Trajectories as tables: columns in TUM's order, t tx ty tz qx qy qz qw, or named by a header (EuRoC, TUM-VI)."""
 
 from __future__ import annotations
 
@@ -52,15 +52,15 @@ def _read(file: CameraFile) -> Trajectory:
     columns = None
     for n, line in enumerate(file.text.splitlines(), 1):
         text, _, comment = line.strip().replace('"', "").partition("#")
-        if ";" in text:
-            text = text.replace(",", ".").replace(";", ",")  # Spreadsheets write this where decimals have commas.
+        if ";" in text:  # Spreadsheets with decimal commas separate columns by semicolons.
+            text = text.replace(",", ".").replace(";", ",")
         words = text.replace(",", " ").split()
         if (header := _header(text or comment, is_comment=not words)) and not rows:
             columns = _columns(file, n, header)
         elif header and _columns(file, n, header) != (columns or TUM):
-            raise file.fault("other columns than before; write a file of one order", n)
+            raise file.fault("other columns than in the lines before; write one order of columns", n)
         elif not words and not header and (match := OTHER_CONVENTION.search(comment)):
-            fault = f"a comment has {truncate(match[0])}, which is not understood"
+            fault = f"a comment states another convention, {truncate(match[0])}"
             raise file.fault(f"{fault}; name the columns in the first line: # {', '.join(COLUMNS)}", n)
         elif words:
             rows.append(_row(file, n, words, columns, separated="," in text))
@@ -86,13 +86,13 @@ def _columns(file: CameraFile, line: int, names: Sequence[str]) -> _Columns:
     bare = [UNIT.sub("", name) for name in names]
     matches = [[n for n, name in enumerate(bare) if re.fullmatch(role, name)] for role in ROLES]
     if any(len(columns) != 1 for columns in matches):
-        fault = f"columns {listed(names)} are not understood"
+        fault = f"unknown or repeated columns in {listed(names)}"
         raise file.fault(f"{fault}; name them {', '.join(COLUMNS)}", line)
     indices = tuple(columns[0] for columns in matches)
     time, *lengths = [(match[1] or match[2] or "") if (match := UNIT.search(names[n])) else "" for n in indices[:4]]
     units = {*lengths} - {""}
     if time not in {"", *TIME_UNITS} or len(units) > 1 or not units <= LENGTH_UNITS.keys():
-        fault = f"{', '.join(names[n] for n in indices[:4])}: units that are not understood"
+        fault = f"{', '.join(names[n] for n in indices[:4])}: unknown or different units"
         remedy = "write [s], [ms], [us] or [ns] for t, and [m] for the others, or [mm] for all of them"
         raise file.fault(f"{fault}; {remedy}", line)
     return _Columns(indices, len(names), TIME_UNITS.get(time), max(lengths) or None)
@@ -101,21 +101,21 @@ def _columns(file: CameraFile, line: int, names: Sequence[str]) -> _Columns:
 def _row(
     file: CameraFile, line: int, words: Sequence[str], columns: _Columns | None, *, separated: bool
 ) -> list[float]:
-    """Convert the words of a line to a pose; `separated` states whether commas separate them."""
+    """Convert the words of a line to a pose; `separated` is whether commas were between them."""
     expected = columns or TUM
     numbers = parse_numbers(words)
     if numbers is None or len(numbers) != expected.column_count:
         needed = f"eight numbers up to {MAX_NUMBER:g}: {' '.join(COLUMNS)}"
         if expected.column_count != TUM.column_count:
             needed = f"{expected.column_count} numbers up to {MAX_NUMBER:g}, one a column of the header"
-        origin = ""
+        hint = ""
         if columns is None and len(words) == 17:
-            origin = ", but 17 numbers, as EuRoC's; keep their header"
+            hint = ", but 17 numbers, as EuRoC's; keep their header"
         elif columns is None and separated:
-            origin = "; numbers with decimal commas need ; between them"
-        raise file.fault(f"not a pose{origin}; expected {needed}", line)
+            hint = "; numbers with decimal commas need ; between them"
+        raise file.fault(f"not a pose{hint}; expected {needed}", line)
     if separated and columns is None:
-        fault = "commas without a header, and w comes first in EuRoC's rows, last in TUM's"
+        fault = "commas without a header, so w may be first, as in EuRoC, or last, as in TUM"
         raise file.fault(f"{fault}; name the columns in a first line: # {', '.join(COLUMNS)}", line)
     return [numbers[n] for n in expected.indices]
 

@@ -1,4 +1,4 @@
-"""CSV export: tables of forces and tracks, one each for all runs.
+"""CSV export: a table of forces and a table of tracks, each for all runs.
 
 forces.csv has the columns of a run's forces.csv. tracks.csv has a row per run, frame and track: the coordinates on the
 sheet, the projected position [px], whether the track is occluded (1 or 0), and its position [m]. The first column of
@@ -55,13 +55,13 @@ def write(sources: Sequence[ExportSource], folder: Path) -> Iterator[list[str]]:
                     tables[key].write(f"run,{','.join(header)}\n")
                 write_rows(run, name or zero_padded(0), tables[key])
             missing = [key for key in writers if key not in available]
-            yield [f"without {key}, which are not among the results; {run.remedy(key)}" for key in missing]
+            yield [f"the results have no {key}; {run.remedy(key)}" for key in missing]
 
 
 def _write_forces(run: FinishedRun, number: str, file: TextIO) -> None:
     path = run.result_path("forces")
     with reading(path), path.open(encoding="ascii", newline="") as source:
-        # The limit bounds the memory for a foreign file; lines of a run are shorter.
+        # Lines of a run are shorter than 4096 characters; the limit bounds the memory for an untrusted file.
         rows = csv.reader(iter(partial(source.readline, 4096), ""))
         if tuple(next(rows)) != FORCES_HEADER:
             raise damaged_result(path)

@@ -6,9 +6,9 @@
     poses_bounds.npy    a row per frame, float64: the matrix [right, up, backward, eye, (height, width, focal length)],
                         shape (3, 5), row by row, from the camera to the world; least and largest depth of the frame
 
-The loaders read integers, and take depths, eyes and bounds in one unit: 0.01 mm, or the next power of ten in which the
-depths fit 16 bits. Their world is the camera of the first frame: EndoNeRF draws its films from there, and with
-normalised device coordinates rays start there. They take a single focal length and the axis through the middle.
+The loaders read integers, and depths, eyes and bounds in one unit: 0.01 mm, or the next power of ten in which the
+depths fit 16 bits. The world axes are those of the first camera, from which EndoNeRF renders its videos, and from which
+rays start in normalised device coordinates. The loaders assume one focal length and a centred principal point.
 
 Source: med-air/EndoNeRF, load_llff.py (`_load_data`, `load_llff_data`) and run_endonerf_helpers.py (`get_rays`) at
 5201b1e; yifliu3/EndoGaussian, scene/endo_loader.py (`load_meta`, `format_infos`, `get_pts_cam`) at d7aad82.
@@ -34,7 +34,7 @@ FORMAT_NAME = "endonerf"
 # Smallest unit of length [m], and the largest value of a pixel.
 MIN_UNIT_M, MAX_VALUE = 1e-5, 65535
 
-# Size of the pictures that EndoGaussian's loader takes for granted [px].
+# Picture size that EndoGaussian's loader assumes [px].
 LOADER_SIZE = (640, 512)
 
 
@@ -76,17 +76,17 @@ write = one_folder_per_run(_write_run)
 
 
 def _require_central(camera: Pinhole, size: tuple[int, int], run: FinishedRun) -> None:
-    """Raise an ArgumentError for a camera with two focal lengths or with its axis off the middle."""
-    across, down = camera.focal.tolist()
+    """Raise an ArgumentError unless the focal lengths are equal and the principal point is centred."""
+    focal_x, focal_y = camera.focal.tolist()
     x, y = (camera.centre - np.array(size) / 2).tolist()
     faults = []
-    if abs(across / down - 1) > 1e-6:
-        faults.append(f"its focal lengths are {across:g} and {down:g} px")
-    # The loaders take the axis through the middle of the pixel right and below of the picture's middle.
+    if abs(focal_x / focal_y - 1) > 1e-6:
+        faults.append(f"its focal lengths are {focal_x:g} and {focal_y:g} px")
+    # The loaders' principal point is the centre of the pixel to the lower right of the picture's centre.
     if max(abs(x), abs(y)) > 0.5 + 1e-6:
-        faults.append(f"its axis is {x:g} px to the right and {y:g} px below the middle")
+        faults.append(f"its principal point is {x:g} px to the right of and {y:g} px below the centre")
     if faults:
-        fault = f"{FORMAT_NAME} has one focal length and an axis through the middle, but {' and '.join(faults)}"
+        fault = f"{FORMAT_NAME} needs one focal length and a centred principal point, and {' and '.join(faults)}"
         width, height = size[0] / 2, size[1] / 2
         remedy = f"run the scene with fx = fy, cx: {width:g} and cy: {height:g}, or with fov"
         raise ArgumentError(f"{run.directory / run.camera}: {fault}; {remedy}")
@@ -97,7 +97,7 @@ def _depth_bounds(run: FinishedRun, frame: int) -> tuple[float, float]:
     depth = read_depth(run, frame)
     visible = depth[depth > 0]
     if not len(visible):
-        fault = f"frame {frame} shows background only, and {FORMAT_NAME} needs the range of depths"
+        fault = f"frame {frame} shows only background, and {FORMAT_NAME} needs a range of depths"
         raise FilesError(f"{run.directory / run.camera}: {fault}; run the scene with a camera that shows the sheet")
     return float(visible.min()), float(visible.max())
 

@@ -39,7 +39,7 @@ from taichi_msm.scene.outputs import OUTPUTS, zero_padded
 
 EXPORT_RECORD = "export.json"
 
-# Files of all formats, as the folder may contain an earlier export of another format; any other file is an error.
+# Files of all formats, as an earlier export may have another format; any other file in the folder is an error.
 EXPORT_PATTERNS = (
     r"export\.json",
     r"index\.csv",
@@ -70,8 +70,8 @@ def export(
         runs: folder of a run, or of a sweep, whose complete runs are exported; or a sequence of folders.
         format: kitti, tapvid, tapvid3d, stir, endonerf, rerun, vtk, gltf, obj or csv.
         out: destination; None for export-FORMAT in the folder of a single run or sweep, or in output for several.
-        progress: called often with the finished frames and the total number of frames; an exception from it cancels the
-            export without changing any file.
+        progress: called with the finished and the total number of frames; an exception in it cancels the export and
+            leaves all files unchanged.
         camera: for runs with several cameras, the name of the camera whose pictures, labels and tracks are exported.
 
     Returns:
@@ -96,7 +96,7 @@ def export(
     if format not in list(FORMATS):
         raise ArgumentError(f"format: {format!r}; take one of {', '.join(FORMATS)}{did_you_mean(str(format), FORMATS)}")
     if camera is not None and FORMATS[format].cameras != ANY_CAMERA:
-        raise ArgumentError(f"camera: {camera!r}; {format} has no choice of a camera; leave it out")
+        raise ArgumentError(f"camera: {camera!r}; {format} does not select a camera; remove camera")
     if out is None:
         folder = Path(directories[0]) if len(directories) == 1 else require_no_link(Path("output"), "--out")
         directory = require_no_link(folder / f"export-{format}", "--out")
@@ -104,16 +104,16 @@ def export(
         directory = Path(out)
     finished, incomplete = read_runs(directories)
     if camera is not None and not any(run.camera_names() for run in finished):
-        raise ArgumentError(f"camera: {camera!r}; {finished[0].directory} has one camera, without a name; leave it out")
-    views = [_camera_views(run, format, camera) for run in finished]
-    exported = _write_export(views, format, directory, progress)
+        raise ArgumentError(f"camera: {camera!r}; {finished[0].directory} has one unnamed camera; remove camera")
+    camera_runs = [_select_cameras(run, format, camera) for run in finished]
+    exported = _write_export(camera_runs, format, directory, progress)
     if incomplete:
         count = f"{incomplete} of {incomplete + len(finished)} runs"
-        exported.notes.insert(0, f"incomplete, and left out: {count}; the sweep's table.csv has the reasons")
+        exported.notes.insert(0, f"incomplete runs are left out, {count}; the sweep's table.csv has the reasons")
     return exported
 
 
-def _camera_views(run: FinishedRun, name: str, camera: str | None) -> list[FinishedRun]:
+def _select_cameras(run: FinishedRun, name: str, camera: str | None) -> list[FinishedRun]:
     """Select the cameras of a run that a format exports; return a copy of the run per camera."""
     export_format, known = FORMATS[name], run.camera_names()
     exported = export_format.cameras
@@ -134,10 +134,10 @@ def _camera_views(run: FinishedRun, name: str, camera: str | None) -> list[Finis
 
 
 def _write_export(
-    views: Sequence[Sequence[FinishedRun]], name: str, directory: Path, progress: ProgressCallback
+    camera_runs: Sequence[Sequence[FinishedRun]], name: str, directory: Path, progress: ProgressCallback
 ) -> Exported:
-    """Write an export atomically; `views` has the copies of each run by `_camera_views`."""
-    runs = [run for run, *_ in views]
+    """Write an export atomically; `camera_runs` has the copies of each run from `_select_cameras`."""
+    runs = [run for run, *_ in camera_runs]
     export_format, total, done = FORMATS[name], sum(run.frames for run in runs), 0
     write: FormatWriter = import_module(f"taichi_msm.exports.{export_format.module or name}").write
     sources, is_numbered = [], len(runs) > 1
@@ -155,7 +155,7 @@ def _write_export(
         exclusive=True,
     )
     with writing(directory), Publication(directory, spec) as publication:
-        for run in chain.from_iterable(views):
+        for run in chain.from_iterable(camera_runs):
             with run.unchanged():
                 if missing := [key for key in export_format.required_outputs if not run.has_output(key)]:
                     remedy = run.remedy(*export_format.required_outputs, *export_format.optional_outputs)
@@ -191,7 +191,7 @@ def _name_run_in_errors(run: FinishedRun, name: str) -> Iterator[None]:
         with np.errstate(over="raise", divide="raise", invalid="raise"):
             yield
     except SceneError as error:
-        # The SceneError suggests to change the scene; here the picture must be restored.
+        # The remedy of a SceneError is a change of the scene; here it is to restore the picture.
         fault = error.lines[0].partition(";")[0]
         raise FilesError(f"{run.directory}: {fault}; {RESTORE_PICTURE}") from None
     except FloatingPointError:

@@ -22,8 +22,8 @@ class Format(NamedTuple):
     file_patterns: tuple[str, ...]  # regular expressions, for `list_files`
     optional_outputs: tuple[str, ...] = ()  # further exported entries of `output`
     numbers_pairs: bool = False  # whether files are numbered by pairs of frames instead of runs
-    cameras: tuple[str, ...] = ()  # exported cameras by name, or ANY_CAMERA; empty: independent of the camera
-    module: str = ""  # if its name differs from the format's
+    cameras: tuple[str, ...] = ()  # names of the exported cameras, or ANY_CAMERA; empty for a format without camera
+    module: str = ""  # name of the module; empty for the name of the format
 
 
 def _patterns_per_run(*patterns: str) -> tuple[str, ...]:
@@ -149,7 +149,7 @@ class RunWriter(Protocol):
 
 
 def one_folder_per_run(write: RunWriter) -> FormatWriter:
-    """Return the writer of a format with a folder for each run, or the folder of the export for a single run."""
+    """Return the writer of a format with a folder per run; a single run is in the folder of the export itself."""
 
     def write_all(sources: Sequence[ExportSource], folder: Path) -> Iterator[list[str]]:
         for run, name, progress in sources:
@@ -160,11 +160,11 @@ def one_folder_per_run(write: RunWriter) -> FormatWriter:
 
 
 def one_path_per_run(write: RunWriter, suffix: str = "") -> FormatWriter:
-    """Return the writer of a format with a file or folder for each run.
+    """Return the writer of a format with a file or folder per run.
 
     Args:
         write: function that creates the file or folder of a run.
-        suffix: suffix of its name, after the number of the run.
+        suffix: suffix of the file name; the stem is the number of the run.
     """
 
     def write_all(sources: Sequence[ExportSource], folder: Path) -> Iterator[list[str]]:
@@ -178,7 +178,7 @@ def read_runs(directories: Sequence[str | Path]) -> tuple[list[FinishedRun], int
     """Read the records of runs, given as folders of runs or of sweeps.
 
     Returns:
-        The runs, only complete ones of sweeps; and the number of incomplete runs.
+        The runs, of sweeps the complete ones; and the number of incomplete runs of sweeps.
 
     Raises:
         FilesError: as for `read_run`, and when no run is complete.
@@ -199,5 +199,5 @@ def read_runs(directories: Sequence[str | Path]) -> tuple[list[FinishedRun], int
         incomplete += count - len(complete)
         runs += complete
     if not runs:
-        raise FilesError(f"{', '.join(map(str, directories))}: no run is complete; table.csv there has the reasons")
+        raise FilesError(f"{', '.join(map(str, directories))}: no run is complete; their table.csv has the reasons")
     return runs, incomplete

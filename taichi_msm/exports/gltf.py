@@ -7,8 +7,8 @@ interpolation. Like this package, glTF uses metres, y up, and texture coordinate
 Browsers store each target in a layer of a texture, and WebGL 2 guarantees 256 layers. Runs that exceed this, or the
 size limit, are reduced to keyframes, and the largest interpolation error is reported.
 
-A tool is a mesh of its instrument, which moves with the tip. glTF's cameras look along -z with y up, and have neither
-lens distortion nor another principal point than the centre.
+A tool is a mesh of its instrument, which moves with the tip. glTF's cameras look along -z with y up, without lens
+distortion, and with the principal point at the centre.
 
 Source: the glTF 2.0 specification of Khronos, sections 3.6 (accessors), 3.7.2.2 (morph targets), 3.10 (cameras), 3.11
 (animations) and 4.4 (GLB). The container is too simple to justify a dependency on pygltflib.
@@ -56,7 +56,7 @@ Numbers = NDArray[Any]
 def _write_run(run: FinishedRun, folder: Path, progress: ProgressCallback) -> list[str]:
     """Write the animated surface with its picture, the tools and cameras."""
     positions, picture = run.positions(), picture_png(run)
-    # Differences of position and normal, float32.
+    # A target has differences of positions and normals, float32.
     target_bytes = 2 * 3 * 4 * positions[0, ..., 0].size
     max_targets = max(1, min(MAX_TARGETS, MAX_TARGETS_BYTES // target_bytes))
     keys = key_frames(positions, 1 + max_targets, progress)
@@ -94,8 +94,8 @@ def _add_sheet(
         displacement = (positions[frame].astype(np.float64) - positions[0]).reshape(-1, 3)
         targets.append(glb.attributes(displacement, unit_normals(positions[frame]) - normals))
     colour = {} if picture is None else {"baseColorTexture": {"index": 0}}
-    rough = {**colour, "metallicFactor": 0.0, "roughnessFactor": 1.0}
-    glb.add("materials", {"name": "sheet", "doubleSided": True, "pbrMetallicRoughness": rough})
+    matte = {**colour, "metallicFactor": 0.0, "roughnessFactor": 1.0}
+    glb.add("materials", {"name": "sheet", "doubleSided": True, "pbrMetallicRoughness": matte})
     if picture is not None:
         glb.add("textures", {"source": 0, "sampler": 0})
         glb.add("images", {"name": "picture", "mimeType": "image/png", "bufferView": glb.view(picture)})
@@ -144,7 +144,7 @@ def _add_cameras(glb: Glb, run: FinishedRun) -> list[str]:
             field = {"xmag": width / 2, "ymag": height / 2, "znear": 0.0, "zfar": 2 * view.distance}
             optics = {"type": "orthographic", "orthographic": field}
         if view.lens is not None or not np.allclose(view.centre, view.size / 2):
-            notes.append(f"{title}: without lens distortion and principal point, which glTF cameras do not have")
+            notes.append(f"{title}: lens distortion and principal point are left out, as glTF cameras have none")
         camera = glb.add("cameras", {"name": title, **optics})
         pose = {
             "translation": np.array([view.eye for view in views]),
@@ -184,7 +184,7 @@ def key_frames(position: Array, limit: int, progress: ProgressCallback = lambda 
     Returns:
         Keyframes, and the largest interpolation error [m].
 
-    Source: Douglas and Peucker 1973, applied to all mass points at once, with a number instead of a tolerance.
+    Source: Douglas and Peucker 1973, for all mass points, limited by the number of keyframes, not by a tolerance.
     """
     count = len(position)
     if count <= limit:
@@ -275,11 +275,14 @@ class Glb:
         return len(self._accessors) - 1
 
     def attributes(self, positions: Numbers, normals: Numbers) -> dict[str, int]:
-        """Return the attributes of a mesh or of a morph target, after appending them.
+        """Append the attributes of a mesh or a morph target.
 
         Args:
             positions: positions of the vertices, or their differences [m], shape (vertices, 3).
             normals: unit normals, or their differences, shape (vertices, 3).
+
+        Returns:
+            Indices of the accessors, by attribute.
         """
         return {
             "POSITION": self.accessor(positions, GL_ARRAY_BUFFER, bounds=True),
@@ -291,11 +294,14 @@ class Glb:
         return self.accessor(triangles.reshape(-1), GL_ELEMENT_ARRAY_BUFFER)
 
     def add(self, kind: str, entry: dict[str, Any]) -> int:
-        """Return the index of an entry, after appending it to the document.
+        """Append an entry to a list of the document.
 
         Args:
             kind: name of the list, such as "nodes".
             entry: content of the entry.
+
+        Returns:
+            Index of the entry in the list.
         """
         self.document.setdefault(kind, []).append(entry)
         return len(self.document[kind]) - 1
@@ -334,5 +340,5 @@ class Glb:
 
 
 def _padding(length: int, filler: bytes) -> bytes:
-    """Return the filler that aligns a chunk or a buffer view to 4 bytes."""
+    """Return the bytes that pad a chunk or a buffer view to a multiple of 4 bytes."""
     return filler * (-length % 4)

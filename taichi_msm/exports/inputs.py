@@ -35,7 +35,7 @@ PICTURE_FILE = "picture.png"
 
 
 def picture_png(run: FinishedRun) -> bytes | None:
-    """Encode the picture on the sheet, cropped to the scene's region, as PNG; return None without a picture.
+    """Encode the picture on the sheet, cropped to the scene's region, as PNG; None without a picture.
 
     Raises:
         SceneError: when the picture cannot be read or has changed since the run.
@@ -61,8 +61,8 @@ def encode_picture(picture: NDArray[np.uint8] | NDArray[np.uint16], format: str,
 def unit_normals(position: NDArray[np.floating]) -> NDArray[np.float64]:
     """Compute the unit normals of the sheet, as used for shading.
 
-    Tangents are central differences, one-sided at edges. The normals of the flat sheet point toward the viewer; where a
-    fold makes the normal vanish, it is set to z.
+    Tangents are central differences, one-sided at edges. The normals of the flat sheet are z; a normal that
+    vanishes at a fold is replaced by z.
 
     Args:
         position: positions of the mass points [m], shape (rows, cols, 3).
@@ -119,7 +119,7 @@ def read_depth(run: FinishedRun, frame: int) -> NDArray[np.float32]:
     """
     path = run.result_path("depth", frame)
     with reading(path), Image.open(path, formats=["TIFF"]) as image:
-        # Before any pixel is decoded.
+        # Checked before pixels are decoded, which could take any memory.
         if image.mode != "F" or image.size != run.scene.render.size:
             raise damaged_result(path)
         depth = np.array(image)
@@ -129,7 +129,7 @@ def read_depth(run: FinishedRun, frame: int) -> NDArray[np.float32]:
 
 
 def read_picture_file(run: FinishedRun, key: str, frame: int) -> bytes:
-    """Return the file of a picture, after validating it by decoding.
+    """Return the content of a picture file, which is decoded once for validation.
 
     Args:
         run: run with its camera selected.
@@ -144,7 +144,7 @@ def read_picture_file(run: FinishedRun, key: str, frame: int) -> bytes:
 
 Array = NDArray[np.float64]
 
-# Pixel coordinates count from the picture's corner here, and from the centre of the first pixel in OpenCV [px].
+# Pixel coordinate of the first pixel's centre; it is 0 in OpenCV [px].
 FIRST_PIXEL_CENTRE = 0.5
 
 
@@ -165,7 +165,7 @@ def read_pinhole(run: FinishedRun, name: str) -> Pinhole:
     """Read camera.json for a format that requires a pinhole camera.
 
     Args:
-        run: the run, with its camera selected.
+        run: run with its camera selected.
         name: name of the format, for messages.
 
     Returns:
@@ -175,19 +175,19 @@ def read_pinhole(run: FinishedRun, name: str) -> Pinhole:
         ArgumentError: when the camera is orthographic or has lens distortion.
     """
     path = run.directory / run.camera / CAMERA_FILE
-    another = "choose another camera by --camera, or " if FORMATS[name].cameras == ANY_CAMERA else ""
+    alternative = "choose another camera by --camera, or " if FORMATS[name].cameras == ANY_CAMERA else ""
     with reading(path):
-        # The limit is sufficient for 100,000 poses.
+        # The limit of 32 MiB suffices for 100,000 poses.
         camera = json.loads(read_regular(run.require_regular_file(path, FORMATS[name].required_outputs[0]), 1 << 25))
-        # Lenses other than the rational one distort even without coefficients.
+        # Lens models other than pinhole distort even if all coefficients are 0.
         is_distorted = camera.get("model", "pinhole") != "pinhole" or bool(np.any(camera.get("distortion", ())))
         is_pinhole = "intrinsics" in camera
     if not is_pinhole:
-        fault = f"{name} needs a pinhole camera, and that of {path} is not"
-        raise ArgumentError(f"{fault}; {another}run the scene with a pinhole camera")
+        fault = f"{name} needs a pinhole camera, and {path} is orthographic"
+        raise ArgumentError(f"{fault}; {alternative}run the scene with a pinhole camera")
     if is_distorted:
-        fault = f"{path}: the camera has a distortion, which {name} cannot describe"
-        raise ArgumentError(f"{fault}; {another}run the scene without it")
+        fault = f"{path}: the camera has lens distortion, which {name} cannot describe"
+        raise ArgumentError(f"{fault}; {alternative}run the scene without it")
     with reading(path):
         matrix = np.array(camera["intrinsics"], float)
         poses = np.array(camera.get("poses", [camera["pose"]] * run.frames), float)[: run.frames]
@@ -202,7 +202,7 @@ def read_pinhole(run: FinishedRun, name: str) -> Pinhole:
 def instrument_mesh(
     solid: Solid,
 ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.int32]]:
-    """Triangulate an instrument around the origin in place of its tip.
+    """Triangulate the surface of an instrument whose tip is at the origin.
 
     Returns:
         Vertices [m] and unit normals, shape (vertices, 3); triangles, counter-clockwise from outside, shape (n, 3).

@@ -30,7 +30,7 @@ from taichi_msm.runs.directory import write_new_file
 from taichi_msm.runs.finished import FinishedRun, reading
 from taichi_msm.scene.outputs import OUTPUTS, zero_padded
 
-# Source of each folder, an entry of `output`.
+# Folders, each with the entry of `output` that it contains.
 SOURCE_OUTPUTS = {"flow_occ": "flow", "flow_noc": "occlusion", "image_2": "png"}
 
 
@@ -73,7 +73,7 @@ def _write_run(run: FinishedRun, training: Path, first: int, progress: ProgressC
             write_new_file(image_2 / f"{name}_1{number}.png", read_picture_file(run, "png", pair + number))
     remedy = run.remedy("occlusion", "png")
     return [
-        f"{name} is left out: {OUTPUTS[key].result} is not among the results; {remedy}"
+        f"{name} is left out, as the results have no {OUTPUTS[key].result}; {remedy}"
         for name, key in SOURCE_OUTPUTS.items()
         if not run.has_output(key)
     ]
@@ -117,7 +117,7 @@ def png16(picture: NDArray[np.uint16]) -> bytes:
     filtered[:, 1:] = rows - above
     # 16 bits per channel, and colour type 2: RGB.
     header = struct.pack(">IIBBBBB", width, height, 16, 2, 0, 0, 0)
-    # For rough flow of 512 x 512 pixels, level 1 takes 17 ms, the default 169 ms for 7 % fewer bytes.
+    # For noisy flow of 512 x 512 pixels, level 1 takes 17 ms, the default 169 ms for 7 % fewer bytes.
     data = zlib.compress(filtered.tobytes(), 1)
     return b"\x89PNG\r\n\x1a\n" + _chunk(b"IHDR", header) + _chunk(b"IDAT", data) + _chunk(b"IEND", b"")
 

@@ -4,7 +4,9 @@
     world/tools/0           capsule of the instrument of a probe, by the number of the probe
     world/tracks            positions of the tracked points
     world/camera            pose and pinhole of the camera; world/cameras/NAME for each of several
-    world/camera/picture    frames; depth next to it [m], and flow as a tensor, shape (height, width, 2) [px]
+    world/camera/picture    frames
+    world/camera/depth      depth [m]
+    world/camera/flow       flow [px], a tensor of shape (height, width, 2)
 
 Lengths are in metres, in the world of the scene, with y up. The timelines are `frame` and `time` [s]. Pixels count from
 the picture's upper left corner, as Rerun's do. Rerun has no lens distortion: pictures are exported as drawn.
@@ -53,16 +55,20 @@ def _write_run(run: FinishedRun, path: Path, progress: ProgressCallback) -> list
     with rerun.RecordingStream("taichi_msm", recording_id=identity) as recording:
         recording.save(path)
         recording.send_recording_name(run.directory.name)
-        # Without the timelines of the export itself.
+        # The time of the export is not a timeline of the recording.
         recording.set_log_time_enabled(False)
         recording.set_log_tick_enabled(False)
         _log_run(run, recording, progress)
         recording.flush()
         recording.disconnect()
-    views = _views(run).values()
-    missing = [key for key in FORMATS["rerun"].optional_outputs if not any(each.has_output(key) for each in views)]
-    notes = [f"without {key}, which is not among the results; {run.remedy(key)}" for key in missing]
-    if any(view_at(run.scene, 0.0, each.camera).lens is not None for each in views):
+    camera_runs = _camera_runs(run).values()
+    missing = [
+        key
+        for key in FORMATS["rerun"].optional_outputs
+        if not any(camera_run.has_output(key) for camera_run in camera_runs)
+    ]
+    notes = [f"the results have no {key}; {run.remedy(key)}" for key in missing]
+    if any(view_at(run.scene, 0.0, camera_run.camera).lens is not None for camera_run in camera_runs):
         notes.append(
             "Rerun has no lens distortion, so projected points deviate from the pictures of a distorted camera"
         )
@@ -72,16 +78,19 @@ def _write_run(run: FinishedRun, path: Path, progress: ProgressCallback) -> list
 write = one_path_per_run(_write_run, ".rrd")
 
 
-def _views(run: FinishedRun) -> dict[str, FinishedRun]:
-    """Return the run with each of its cameras selected, by the camera's entity."""
+def _camera_runs(run: FinishedRun) -> dict[str, FinishedRun]:
+    """Return a copy of the run for each of its cameras, by the entity of the camera."""
     names = run.camera_names()
     entities = {f"world/cameras/{name}": name for name in names} if names else {"world/camera": ""}
     return {entity: replace(run, camera=name) for entity, name in entities.items()}
 
 
 def _log_run(run: FinishedRun, recording: Any, progress: ProgressCallback) -> None:
-    positions, views = run.positions(), _views(run)
-    tracks = next((read_track_positions(each)[1] for each in views.values() if each.has_output("tracks")), None)
+    positions, camera_runs = run.positions(), _camera_runs(run)
+    tracks = next(
+        (read_track_positions(camera_run)[1] for camera_run in camera_runs.values() if camera_run.has_output("tracks")),
+        None,
+    )
     # Distinct colours; the hues of successive points are 0.618 turns apart.
     phase = np.arange(0 if tracks is None else len(tracks))[:, None] * 0.618 + np.array([0, 1 / 3, 2 / 3])
     colours = (127.5 + 127.5 * np.cos(2 * np.pi * phase)).astype(np.uint8)
@@ -101,15 +110,15 @@ def _log_run(run: FinishedRun, recording: Any, progress: ProgressCallback) -> No
             recording.log(f"world/tools/{number}", rerun.Transform3D(translation=solid.tip))
         if tracks is not None:
             recording.log("world/tracks", rerun.Points3D(tracks[:, frame], colors=colours))
-        for entity, each in views.items():
-            view = view_at(run.scene, time, each.camera)
-            if view.pinhole and (frame == 0 or is_moving(run.scene, each.camera)):
+        for entity, camera_run in camera_runs.items():
+            view = view_at(run.scene, time, camera_run.camera)
+            if view.pinhole and (frame == 0 or is_moving(run.scene, camera_run.camera)):
                 recording.log(entity, *_pinhole(view))
-            _log_pictures(each, frame, entity, recording)
+            _log_pictures(camera_run, frame, entity, recording)
 
 
 def _mesh(run: FinishedRun, position: NDArray[np.floating], *, is_first: bool) -> Any:
-    """Build the mesh of the first frame, or the vertices of a later one, for which the viewer keeps the rest."""
+    """Build the mesh of the first frame, or only vertices of a later one; the viewer keeps triangles and texture."""
     vertices: dict[str, Any] = {"vertex_positions": position.reshape(-1, 3), "vertex_normals": unit_normals(position)}
     if not is_first:
         return rerun.Mesh3D.from_fields(**vertices)

@@ -8,13 +8,13 @@ Every run has a folder with
     left/seq00/segmentation/icgendseg.png           the same for the last frame
     left/seq00/0ms_icgstart.png, 1200ms_icgend.png  first and last frame
 
-Instead of infrared pictures, which show only the tattoos, the start and end pictures are visible frames: the loader
-needs their texture to match left and right tracks. Marked are the tracks that are visible to both cameras in the first
-and last frame, unless their discs would touch. The centre of a disc is the pixel that contains the track.
+The start and end pictures are visible frames, as infrared pictures show only the tattoos, and the loader matches left
+and right tracks by texture. A track is marked if both cameras see it in the first and last frame, and its disc touches
+no other disc. The centre of a disc is the pixel that contains the track.
 
-A position X in the axes of the left camera (OpenCV's, [m]) is `rotation` X + `translation` in those of the right one,
-so that the first component of `translation` is the negative baseline. Camera matrices count from the centre of the
-first pixel.
+A position X_left in the axes of the left camera (OpenCV's, [m]) is X_right = `rotation` X_left + `translation` in
+those of the right one: the first component of `translation` is the negative baseline. Camera matrices count from the
+centre of the first pixel.
 
 Source: athaddius/STIRLoader, STIRLoader/STIRLoader.py at 7e7f87c (lines 23 to 53, 69 to 80, 128 to 200, 204 to 281,
 336 to 401, 582 to 587, 695 to 706).
@@ -42,7 +42,7 @@ from taichi_msm.scene import outputs
 
 FORMAT_NAME, CAMERAS = "stir", ("left", "right")
 
-# Limits of STIR's loader: size of the pictures [px], and disparities that it triangulates.
+# Limits of STIR's loader: picture size [px], range of disparities that it triangulates.
 LOADER_SIZE, MIN_DISPARITY_PX, MAX_DISPARITY_PX = (1280, 1024), 8, 105
 
 # Tolerance of a rectified stereo pair: deviation of the rotation matrix, and offsets relative to the baseline.
@@ -57,18 +57,18 @@ def _write_run(run: FinishedRun, folder: Path, progress: ProgressCallback) -> li
         raise NotInstalledError(f"--format {outputs.PYAV_NOT_INSTALLED.replace('mp4', FORMAT_NAME, 1)}")
     runs = [replace(run, camera=side) for side in CAMERAS]
     folder.mkdir()
-    left, right = (read_pinhole(each, FORMAT_NAME) for each in runs)
+    left, right = (read_pinhole(camera_run, FORMAT_NAME) for camera_run in runs)
     baseline = _baseline(run, left, right)
     write_new_file(folder / "calib.json", (json.dumps(_calibration(left, right, baseline), indent=2) + "\n").encode())
     radius = max(1, round(run.scene.render.size[0] / 160))
     pixels, tracks = _choose_tracks(runs, radius)
-    for number, each in enumerate(runs):
-        sequence = folder / each.camera / "seq00"
+    for number, camera_run in enumerate(runs):
+        sequence = folder / camera_run.camera / "seq00"
         (sequence / "segmentation").mkdir(parents=True)
         for name, centres in zip(("start", "end"), pixels[number], strict=True):
             mask = encode_picture(_discs(centres, run.scene.render.size, radius), "PNG")
             write_new_file(sequence / "segmentation" / f"icg{name}seg.png", mask)
-        _write_frames(each, sequence, partial(_report_progress, progress, number))
+        _write_frames(camera_run, sequence, partial(_report_progress, progress, number))
     return _notes(run.scene.render.size, pixels, tracks, baseline)
 
 
@@ -99,7 +99,7 @@ def _calibration(left: Pinhole, right: Pinhole, baseline: float) -> dict[str, An
 
 
 def _report_progress(progress: ProgressCallback, before: int, done: int, total: int) -> None:
-    """Convert the progress of a camera, after `before` finished ones, to that of both."""
+    """Report the progress of a camera as progress of both; `before` cameras are finished."""
     progress(before * total + done, len(CAMERAS) * total)
 
 

@@ -33,7 +33,7 @@ from taichi_msm.system.process import available_memory
 
 
 class _Pickler(pickle.Pickler):
-    """Pickler for arrays that NumPy 1 can read; NumPy 2 would refer to a module that 1.26.0 lacks."""
+    """Pickler for arrays that NumPy 1 can read; by default NumPy 2 refers to a module that 1.26.0 lacks."""
 
     def reducer_override(self, value: Any) -> Any:
         if isinstance(value, np.ndarray):

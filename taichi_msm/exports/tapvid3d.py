@@ -59,7 +59,7 @@ def _write_run(run: FinishedRun, path: Path, progress: ProgressCallback) -> list
     with create_file(path) as archive:
         write_arrays(archive, arrays)
     tracks, omitted = len(occluded), len(occluded) - int(is_exported.sum())
-    return [f"{omitted} of {tracks} tracks are left out, as they are visible in no frame"] if omitted else []
+    return [f"{omitted} of {tracks} tracks are left out, as no frame shows them"] if omitted else []
 
 
 write = one_path_per_run(_write_run, ".npz")

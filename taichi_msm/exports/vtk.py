@@ -1,4 +1,4 @@
-"""VTK export for ParaView: an unstructured grid per frame (.vtu), and a collection of them with their times (.pvd).
+"""VTK export for ParaView: an unstructured grid per frame (.vtu), and a collection of the grids with times (.pvd).
 
 The points of a grid are the mass points in row-major order from the top left, and its triangles are those of the
 rendered surface. The data of each point are
@@ -87,7 +87,7 @@ def speed(positions: Array, time: Array, frame: int) -> Array:
 
 
 def _grid(position: Array, values: dict[str, Array]) -> Element:
-    """Build a .vtu file with point data, which are stored in the precision of the run."""
+    """Build a .vtu file with point data in the precision of the run."""
     mesh = refine_surface(position, EXPORT_REFINE)
     root = Element("VTKFile", type="UnstructuredGrid", version="1.0", byte_order="LittleEndian")
     root.attrib |= {"header_type": "UInt64", "compressor": "vtkZLibDataCompressor"}
@@ -105,7 +105,7 @@ def _grid(position: Array, values: dict[str, Array]) -> Element:
 
 
 def _add_array(parent: Element, name: str, array: NDArray[Any]) -> None:
-    """Add numbers, compressed as a single block after a header with the sizes of blocks."""
+    """Add an array: a header with the block sizes, then a single compressed block."""
     kind, components = f"{TYPES[array.dtype.kind]}{8 * array.itemsize}", str(array[0].size)
     element = SubElement(parent, "DataArray", type=kind, Name=name, NumberOfComponents=components, format="binary")
     content = array.astype(array.dtype.newbyteorder("<")).tobytes()

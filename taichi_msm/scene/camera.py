@@ -28,21 +28,21 @@ from taichi_msm.scene.section import (
     scene_fault,
 )
 
-_COEFFICIENT = "a number, {:g} to {:g}"
+_COEFFICIENT_EXPECTS = "a number, {:g} to {:g}"
 Coefficient = Annotated[Number, Field(ge=-MAX_COEFFICIENT, le=MAX_COEFFICIENT)]
-_ANY_COEFFICIENT = _COEFFICIENT.format(-MAX_COEFFICIENT, MAX_COEFFICIENT)
+_ANY_COEFFICIENT = _COEFFICIENT_EXPECTS.format(-MAX_COEFFICIENT, MAX_COEFFICIENT)
 
-_FOCAL_LENGTH = "a number above 0, in pixels"
-_FOCAL_MEANING = "focal length [px]; required unless the lens has one, as scaramuzza does"
+_FOCAL_EXPECTS = "a number above 0, in pixels"
+_FOCAL_MEANING = "focal length [px]; required unless the lens model has one (scaramuzza)"
 
 
 class Intrinsics(Section):
-    """Focal lengths and principal point of a calibrated camera, in OpenCV's pixels."""
+    """Focal lengths and principal point, in OpenCV's pixel coordinates."""
 
-    fx: Positive | None = key(None, f"horizontal {_FOCAL_MEANING}", _FOCAL_LENGTH)
-    fy: Positive | None = key(None, f"vertical {_FOCAL_MEANING}", _FOCAL_LENGTH)
-    cx: Coefficient = key(..., "horizontal principal point [px]; the centre of the first pixel is 0", _ANY_COEFFICIENT)
-    cy: Coefficient = key(..., "vertical principal point [px]; the centre of the first pixel is 0", _ANY_COEFFICIENT)
+    fx: Positive | None = key(None, f"horizontal {_FOCAL_MEANING}", _FOCAL_EXPECTS)
+    fy: Positive | None = key(None, f"vertical {_FOCAL_MEANING}", _FOCAL_EXPECTS)
+    cx: Coefficient = key(..., "x of the principal point [px]; 0 is the centre of the first pixel", _ANY_COEFFICIENT)
+    cy: Coefficient = key(..., "y of the principal point [px]; 0 is the centre of the first pixel", _ANY_COEFFICIENT)
 
 
 def _alternatives(names: Iterable[str]) -> str:
@@ -59,12 +59,12 @@ class _Model(Section):
 
 
 def _coefficient_keys() -> dict[str, Any]:
-    """Return the keys of all coefficients, for pydantic; a key of several models has the meaning of the first."""
+    """Return pydantic's fields of all coefficients; a coefficient of several lens models has the field of the first."""
     coefficients = {name: row for model in reversed(MODELS.values()) for name, row in model.coefficients.items()}
     return {
         name: (
             Annotated[Number, Field(ge=row.least, le=row.most)] | None,
-            key(row.default, row.meaning, _COEFFICIENT.format(row.least, row.most)),
+            key(row.default, row.meaning, _COEFFICIENT_EXPECTS.format(row.least, row.most)),
         )
         for name, row in sorted(coefficients.items())
     }
@@ -74,16 +74,16 @@ _Coefficients: Any = create_model("_Coefficients", __base__=_Model, **_coefficie
 
 
 class Distortion(_Coefficients):  # type: ignore[misc]
-    """Lens distortion: a lens model and its coefficients, a key each."""
+    """Lens distortion: a lens model, and a key for each coefficient."""
 
     @property
     def coefficients(self) -> tuple[float, ...]:
-        """Coefficients of the model, in its order."""
+        """Coefficients of the lens model, in the order of `LensModel.coefficients`."""
         return tuple(getattr(self, name) for name in MODELS[self.model].coefficients)
 
     @property
     def focal_length(self) -> float | None:
-        """Focal length of the lens [px]; None if `intrinsics` has it."""
+        """Focal length in the lens model [px]; None for a model without one."""
         name = MODELS[self.model].focal_length
         return getattr(self, name) if name else None
 
@@ -95,33 +95,33 @@ class Distortion(_Coefficients):  # type: ignore[misc]
         coefficients = MODELS[self.model].coefficients
         for name, row in coefficients.items():
             if getattr(self, name) is None:
-                raise scene_fault(f"missing; expected {_COEFFICIENT.format(row.least, row.most)}", name)
+                raise scene_fault(f"missing; expected {_COEFFICIENT_EXPECTS.format(row.least, row.most)}", name)
         for name in sorted(self.model_fields_set - {"model", *coefficients}):
             if getattr(self, name):
                 models = _alternatives(model for model, row in MODELS.items() if name in row.coefficients)
                 *names, last = coefficients
-                raise scene_fault(f"goes with model: {models}; a {self.model} has {', '.join(names)} and {last}", name)
+                raise scene_fault(f"requires model: {models}; {self.model} has {', '.join(names)} and {last}", name)
         return self
 
 
 Rotation = tuple[Vector, Vector, Vector]
-_ROTATION = "three rows of three numbers: an orthonormal matrix"
+_ROTATION_EXPECTS = "three rows of three numbers: an orthonormal matrix"
 
 
 class Pose(Section):
     """Extrinsics of a camera, in OpenCV's axes: x right, y down, z forward."""
 
-    rotation: Rotation = key(..., "rotation from the world's axes to the camera's", _ROTATION)
-    translation: Vector = key(..., "world's origin in the camera's axes [m]", "three numbers: [x, y, z] in metres")
+    rotation: Rotation = key(..., "rotation from the world's axes to the camera's", _ROTATION_EXPECTS)
+    translation: Vector = key(..., "world origin in the camera's axes [m]", "three numbers: [x, y, z] in metres")
 
 
-# Keyframes of a vector: t [s], x, y, z; and of a pose: t [s], position [m], quaternion x, y, z, w.
+# Keyframes: of a vector [t, x, y, z], of a pose [t, position, quaternion x, y, z, w]; t [s], position [m].
 VectorKeyframes = Annotated[tuple[tuple[Number, Number, Number, Number], ...], Field(min_length=1)]
 PoseRows = Annotated[
     tuple[tuple[Number, Number, Number, Number, Number, Number, Number, Number], ...], Field(min_length=1)
 ]
 
-_OR_KEYFRAMES = " or keys [[t, x, y, z], ...], t in seconds"
+_OR_KEYFRAMES = " or keyframes [[t, x, y, z], ...], t in seconds"
 
 
 class Camera(Section):
@@ -129,32 +129,30 @@ class Camera(Section):
 
     calibration: FilePath | None = key(
         None,
-        "in place of fov and distortion: calibration file of OpenCV, ROS, SCARED, STIR, StereoMIS, Kalibr or COLMAP, "
+        "in place of fov and distortion: calibration of OpenCV, ROS, SCARED, STIR, StereoMIS, Kalibr or COLMAP, a file "
         "relative to the scene file",
         "the path of a file",
     )
     calibration_eye: Literal["left", "right"] = key(
-        "left", "camera of the calibration of a stereo pair", "left or right"
+        "left", "camera of a stereo calibration that is read", "left or right"
     )
     calibration_unit: Literal["m", "mm"] | None = key(
-        None, "unit of lengths in the calibration, the distance of the cameras of a stereo pair", "m or mm"
+        None, "unit of the translation T in a stereo calibration", "m or mm"
     )
-    scale: StrictBool = key(
-        False, "whether a calibration for another picture size is scaled to this one", "true or false"
-    )
+    scale: StrictBool = key(False, "scale a calibration of another picture size to this one", "true or false")
     intrinsics: Intrinsics | None = key(
         None,
-        "in place of fov: focal lengths and principal point, in OpenCV's pixels",
+        "in place of fov: focal lengths and principal point, in OpenCV's pixel coordinates",
         "a mapping with fx, fy, cx and cy",
     )
     distortion: Distortion | None = key(
         None,
-        "lens distortion, in OpenCV's terms",
+        "lens distortion: model and coefficients, as in OpenCV",
         "a mapping with k1, k2, p1, p2, k3 to k6, or with another model and its coefficients",
     )
     outside: Literal["refuse", "background"] = key(
         "refuse",
-        "treatment of pixels where the distortion is not invertible: refuse the scene, or draw the background",
+        "pixels where the distortion is not invertible: refuse the scene, or draw the background",
         "refuse or background",
     )
     pose: Pose | None = key(
@@ -164,41 +162,41 @@ class Camera(Section):
     )
     poses: FilePath | PoseRows | None = key(
         None,
-        "in place of eye, target and up: trajectory of the camera, a file of TUM, EuRoC, KITTI or COLMAP, relative to "
-        "the scene file, or its rows [t, tx, ty, tz, qx, qy, qz, qw], from the camera to the world",
+        "in place of eye, target and up: trajectory, the transform from the camera to the world: a file of TUM, EuRoC, "
+        "KITTI or COLMAP, relative to the scene file, or rows [t, tx, ty, tz, qx, qy, qz, qw]",
         "the path of a file, or rows [[t, tx, ty, tz, qx, qy, qz, qw], ...]",
     )
     poses_unit: Literal["m", "mm"] | None = key(
-        None, "unit of positions in the file of poses; metres unless its header has another one", "m or mm"
+        None, "unit of positions in the file of poses; default: that of its header, else m", "m or mm"
     )
     poses_time: Literal["s", "ms", "us", "ns"] | None = key(
-        None, "unit of times in the file of poses; seconds unless its header has another one", "s, ms, us or ns"
+        None, "unit of times in the file of poses; default: that of its header, else s", "s, ms, us or ns"
     )
     poses_start: Number | None = key(
         None,
-        "where the scene begins in the file of poses [s]: a time of the file, or, before its first pose, the time "
-        "after that one; without it, the times of the file are those of the scene",
+        "time in the file of poses at which the scene begins [s]; below the first time of the file, counted from its "
+        "first pose; default: the scene has the times of the file",
         "a number, in seconds",
     )
     poses_rate: Positive | None = key(
-        None, "poses per second of a file without times, as of KITTI and COLMAP", "a number above 0"
+        None, "poses per second of a file without times (KITTI, COLMAP)", "a number above 0"
     )
     beside: Annotated[str, Field(strict=True, min_length=1)] | None = key(
         None,
-        "in `cameras`, in place of eye, pose and poses: name of the reference camera of a stereo pair, with which this "
-        "camera moves",
+        "in `cameras`, in place of eye, pose and poses: name of the reference camera of a stereo pair, to which this "
+        "camera is fixed",
         "the name of another camera",
     )
     baseline: Number | None = key(
         None,
-        "with beside: this camera is a copy of the reference camera, at this distance along its x axis [m]",
-        "a number but 0, in metres",
+        "with beside: distance from the reference camera along its x axis [m]; lens and direction are the same",
+        "a number other than 0, in metres",
     )
     rotation: Rotation | None = key(
         None,
         "with beside, in place of baseline: R of OpenCV's stereoCalibrate, from the axes of the reference camera to "
-        "those of this one; without intrinsics, calibration and fov, this camera has the lens of the reference camera",
-        _ROTATION,
+        "those of this one; default of intrinsics, calibration and fov: the lens of the reference camera",
+        _ROTATION_EXPECTS,
     )
     translation: Vector | None = key(
         None,
@@ -221,7 +219,7 @@ class Camera(Section):
         "direction that is up in the picture, or its keyframes",
         "three numbers: [x, y, z]," + _OR_KEYFRAMES,
     )
-    # In f32, directions are resolved to 2^-24, 3.4e-6 degrees; below the minimum, about 300 rows would be distinct.
+    # f32 resolves directions to 2^-24 rad, 3.4e-6 degrees: at the minimum, about 300 rows of pixels are distinct.
     fov: Annotated[Number, Field(ge=0.001, lt=180)] = key(
         40.0,
         "vertical field of view, without distortion [degrees]",
@@ -230,7 +228,7 @@ class Camera(Section):
 
     @property
     def has_own_lens(self) -> bool:
-        """Whether a camera with a reference camera has intrinsics, rather than those of the reference camera."""
+        """Whether the camera has intrinsics of its own, not those of its reference camera."""
         return self.intrinsics is not None or "fov" in self.model_fields_set
 
     @property
@@ -240,7 +238,7 @@ class Camera(Section):
 
     @property
     def focal_lengths(self) -> tuple[float, float]:
-        """Focal lengths along x and y, those of `intrinsics` or that of the lens [px]."""
+        """Focal lengths fx, fy [px]: that of the lens model, else those of `intrinsics`."""
         assert self.intrinsics is not None
         lens_focal = self.distortion.focal_length if self.distortion else None
         focal_x, focal_y = lens_focal or self.intrinsics.fx, lens_focal or self.intrinsics.fy
@@ -259,7 +257,7 @@ class Camera(Section):
     @field_validator("eye", "target", "up", mode="after")
     @classmethod
     def _check_order(cls, keyframes: Any, info: ValidationInfo) -> Any:
-        if info.field_name == "eye" and keyframes is None and not {"beside", "pose", "poses"} & _given(info):
+        if info.field_name == "eye" and keyframes is None and not {"beside", "pose", "poses"} & _given_before(info):
             raise scene_fault("missing; expected " + cls.model_fields["eye"].json_schema_extra["expects"])  # type: ignore
         if keyframes is not None and isinstance(keyframes[0], tuple):
             require_increasing(keyframes)
@@ -272,57 +270,58 @@ class Camera(Section):
             self._check_pair(given)
         for name in ("baseline", "rotation", "translation") if self.beside is None else ():
             if name in given:
-                raise scene_fault("goes with beside, the name of another camera; add it or remove this", name)
+                raise scene_fault(f"requires beside, the name of another camera; add beside or remove {name}", name)
         for name in ("scale", "calibration_eye", "calibration_unit") if self.calibration is None else ():
             if getattr(self, name) != type(self).model_fields[name].default:
-                raise scene_fault("goes with calibration; remove it", name)
+                raise scene_fault(f"requires calibration; remove {name}", name)
         for name in PoseKeys._fields if not isinstance(self.poses, str) else ():
             if name in given:
-                raise scene_fault("goes with poses, the path of a file; remove it", name)
+                raise scene_fault(f"requires poses, the path of a file; remove {name}", name)
         if self.outside == "background" and self.distortion is None and self.calibration is None:
-            raise scene_fault("goes with distortion; remove it", "outside")
+            raise scene_fault("requires distortion; remove outside", "outside")
         self._check_focal_length()
         exclusive = (("calibration", "intrinsics", "fov"), ("pose", "poses", "eye"), ("calibration", "distortion"))
         for names in exclusive:
             if len(both := [name for name in names if name in given]) > 1:
-                raise scene_fault(f"is given together with {both[0]}; remove one of them", both[1])
+                raise scene_fault(f"conflicts with {both[0]}; remove one of them", both[1])
         for name in {"target", "up"} & given if {"pose", "poses"} & given else ():
-            raise scene_fault("goes with eye; a pose has its direction", name)
+            raise scene_fault(f"requires eye, as pose and poses have a direction; remove {name}", name)
         return self
 
     def _check_pair(self, given: set[str]) -> None:
         """Check the keys of a camera with a reference camera."""
         for name in sorted({"eye", "pose", "poses", "target", "up"} & given):
-            raise scene_fault("is given together with beside, which places the camera; remove it", name)
+            raise scene_fault(f"conflicts with beside, which sets the pose; remove {name}", name)
         if self.baseline is not None:
             for name in sorted(given - {"beside", "baseline"}):
-                message = f"is given together with baseline, and this camera is then a copy of {self.beside}"
-                raise scene_fault(f"{message}; remove it, or take rotation and translation in place of baseline", name)
+                message = f"conflicts with baseline, which copies {self.beside}"
+                remedy = f"remove {name}, or replace baseline by rotation and translation"
+                raise scene_fault(f"{message}; {remedy}", name)
             if abs(self.baseline) < MIN_MAGNITUDE:
-                fault = f"{self.baseline:g} puts it where {self.beside} is"
-                raise scene_fault(f"{fault}; expected a number but 0, in metres", "baseline")
+                fault = f"{self.baseline:g} is the position of {self.beside}"
+                raise scene_fault(f"{fault}; expected a number other than 0, in metres", "baseline")
         elif missing := {"rotation", "translation"} - given:
             for name in {"rotation", "translation"} & given:
-                raise scene_fault(f"goes with {missing.pop()}; add it", name)
+                raise scene_fault(f"requires {missing.pop()}; add it", name)
             if self.calibration is None:
-                message = "missing; expected a number but 0, in metres, or rotation and translation in its place"
+                message = "missing; expected a number other than 0, in metres; or add rotation and translation"
                 raise scene_fault(message, "baseline")
         if self.distortion is not None and not self.has_own_lens:
-            message = f"goes with intrinsics or fov; without them this camera has the lens of {self.beside}"
-            raise scene_fault(message, "distortion")
+            fault = f"requires intrinsics or fov, as the default is the lens of {self.beside}"
+            raise scene_fault(f"{fault}; add one of them or remove distortion", "distortion")
 
     def _check_focal_length(self) -> None:
         """Check that the focal length is in `intrinsics` or in the lens, or that both agree."""
         lens_focal = self.distortion.focal_length if self.distortion else None
         if self.intrinsics is None:
             if lens_focal is not None:
-                fault = "missing; its lens has the focal length, and the principal point is in pixels"
+                fault = "missing; the lens model has the focal length, but no principal point"
                 raise scene_fault(f"{fault}; add intrinsics: {{cx: ..., cy: ...}}", "intrinsics")
             return
         for name in ("fx", "fy"):
             focal = getattr(self.intrinsics, name)
             if focal is None and lens_focal is None:
-                raise scene_fault(f"missing; expected {_FOCAL_LENGTH}", "intrinsics", name)
+                raise scene_fault(f"missing; expected {_FOCAL_EXPECTS}", "intrinsics", name)
             if focal and lens_focal and not math.isclose(focal, lens_focal, rel_tol=ROUNDING_TOLERANCE):
                 fault = f"{focal:g} is not the focal length of the lens, a0 = {lens_focal:g}"
                 raise scene_fault(f"{fault}; remove fx and fy", "intrinsics", name)
@@ -337,7 +336,7 @@ class Camera(Section):
         return type(self).model_fields.keys() - needed
 
     def with_poses(self) -> Self:
-        """Return a copy with the rows of the trajectory file, if there is one."""
+        """Return a copy with the trajectory file replaced by its rows; the camera itself without a file."""
         if not isinstance(self.poses, str):
             return self
         try:
@@ -348,13 +347,16 @@ class Camera(Section):
         return self.model_validate(kept | {"poses": rows})
 
     def calibrated(self, size: tuple[int, int]) -> Self:
-        """Return a copy with the intrinsics and distortion of the calibration file for pictures of a size [px]."""
+        """Return a copy with the calibration file replaced by its intrinsics and distortion.
+
+        Pictures have `size` (width, height) [px]. Without a file, the camera itself is returned.
+        """
         if self.calibration is None:
             given = self.intrinsics
             if given and given.fx and given.fy and (fault := focal_fault((given.fx, given.fy), size)):
                 raise scene_fault(fault, "intrinsics")
             return self
-        # Only a stereo pair uses the distance of the cameras.
+        # Only stereo pairs use lengths of the calibration.
         unit = self.calibration_unit if self.beside else "m"
         try:
             calibration = read_calibration(self.calibration, self.calibration_eye, unit)
@@ -363,19 +365,19 @@ class Camera(Section):
         if calibration.focal and (fault := focal_fault(calibration.focal, calibration.size or size)):
             raise scene_fault(f"{self.calibration}: {fault}", "calibration")
         if self.scale and calibration.size is None:
-            fault = "has no size of its pictures, so it cannot be scaled; add image_width and image_height"
+            fault = "lacks the picture size, which scale needs; add image_width and image_height"
             raise scene_fault(f"{self.calibration}: {fault}, or remove scale", "calibration")
         scale_x, scale_y = (new / old for new, old in zip(size, calibration.size or size, strict=True))
         if (scale_x, scale_y) != (1, 1) and not self.scale:
             assert calibration.size is not None
             raise scene_fault(
-                f"{self.calibration}: of pictures of {calibration.size[0]} x {calibration.size[1]} pixels, not of "
-                f"{size[0]} x {size[1]}; set render.size to these, or scale: true",
+                f"{self.calibration}: calibrates pictures of {calibration.size[0]} x {calibration.size[1]} pixels, and "
+                f"render.size is {size[0]} x {size[1]}; set render.size: {list(calibration.size)}, or scale: true",
                 "calibration",
             )
         calibration = calibration.scaled(scale_x, scale_y)
         intrinsics = dict(zip(("cx", "cy", "fx", "fy"), calibration.centre + (calibration.focal or ()), strict=False))
-        update: dict[str, Any] = {"intrinsics": intrinsics, **self._pair_of(calibration)}
+        update: dict[str, Any] = {"intrinsics": intrinsics, **self._stereo_pose(calibration)}
         unused = {"calibration", "calibration_eye", "calibration_unit", "scale"}
         if calibration.model != "pinhole" or any(calibration.coefficients.values()):
             update["distortion"] = {"model": calibration.model, **calibration.coefficients}
@@ -391,23 +393,23 @@ class Camera(Section):
                 value += " for pictures of this size; calibrate at a size near it"
             raise scene_fault(f"{self.calibration}: {value}", "scale" if self.scale else "calibration") from None
 
-    def _pair_of(self, calibration: Calibration) -> dict[str, Any]:
-        """Return rotation and translation of a stereo calibration, for a camera with a reference camera."""
+    def _stereo_pose(self, calibration: Calibration) -> dict[str, Any]:
+        """Return the keys rotation and translation of a stereo calibration; empty for a camera without `beside`."""
         if self.beside is None or calibration.right is None:
             if self.beside is not None and self.rotation is None:
                 remedy = "set calibration_eye: right for a stereo file, or add rotation and translation"
                 if self.calibration_eye == "right":
-                    remedy = "write R, 3 x 3, and T, 3 numbers, as stereoCalibrate, or add rotation and translation"
+                    remedy = "write R, 3 x 3, and T, 3 numbers, of stereoCalibrate, or add rotation and translation"
                 raise scene_fault(f"{self.calibration}: has no R and T of this camera; {remedy}", "calibration")
             return {}
         if self.rotation is not None:
-            raise scene_fault(f"is given together with R and T of {self.calibration}; remove one of them", "rotation")
+            raise scene_fault(f"conflicts with R and T of {self.calibration}; remove one of them", "rotation")
         return calibration.right._asdict()
 
 
-def _given(info: ValidationInfo) -> set[str]:
-    """Return the keys before the validated key that have a value, valid or not."""
+def _given_before(info: ValidationInfo) -> set[str]:
+    """Return the keys declared before the validated one that have a value, valid or not."""
     fields = list(Camera.model_fields)
     previous = fields[: fields.index(str(info.field_name))]
-    # The data lacks keys with an invalid value.
+    # `info.data` lacks keys with an invalid value.
     return {name for name in previous if info.data.get(name, name) is not None}

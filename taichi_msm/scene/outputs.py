@@ -1,6 +1,6 @@
 """Outputs of a run, and the names of their files.
 
-A new output is a row of the table in this module and of that in its page, and a field with its values.
+docs/architecture.md has the steps to add an output.
 """
 
 from __future__ import annotations
@@ -18,39 +18,39 @@ def is_pyav_installed() -> bool:
     return find_spec("av") is not None
 
 
-# Files of a run without an entry of `output`: the record, and the matrices of a camera.
+# Files of a run that no entry of `output` selects: the record, and the matrices of a camera.
 RUN_RECORD, CAMERA_FILE = "run.json", "camera.json"
 
-# Record in the folder of a sweep; its folder with a folder for each run; pattern of the names of these, run numbers.
+# Folder of a sweep: its record, the folder of the runs, and the pattern of their folders' names, the run numbers.
 SWEEP_RECORD, RUNS_FOLDER = "sweep.json", "runs"
 NUMBER_PATTERN = r"[0-9]{6,}"
 
 # Prefix of the default folders of exports.
 EXPORT_PREFIX = "export-"
 
-# Names of cameras, which are also names of folders.
+# Camera names, which are also folder names: longest length, pattern.
 MAX_CAMERA_NAME = 64
 CAMERA_NAME = rf"[a-z0-9_-]{{1,{MAX_CAMERA_NAME}}}"
 
-# Number of the first frame in the name of its file.
+# Frame number in the file name of the first frame.
 FIRST_FRAME = "0000"
 
-# Columns of the table of forces.
+# Columns of forces.csv.
 FORCES_HEADER = ("time", "probe", "tip_x", "tip_y", "tip_z", "force_x", "force_y", "force_z")
 
 
 class Output(NamedTuple):
     """An output of a run, which an entry of a scene's `output` selects."""
 
-    # Of the sources labels, flow and stereo, also the field of `Labels`, `Flow` or `Stereo` that is written, in the
-    # format of the file's suffix.
+    # Of the sources labels, flow and stereo, the name is also the field of `Labels`, `Flow` or `Stereo` to write; the
+    # suffix of `file` is the format.
     name: str
-    file: str  # path, or that of the first frame of a series
+    file: str  # path of the file, or of the first file of a series
     source: Literal["picture", "labels", "flow", "stereo", "tracks", "positions", "forces"]
-    pixel_bytes: float = 0  # upper bound of the file's size per pixel, of a picture of noise; 0 if independent of them
+    pixel_bytes: float = 0  # largest file size per pixel, that of noise [bytes]; 0 if independent of the pixels
     needs_camera: bool = False  # whether the values are meaningful only with the camera's matrices
     needs_stereo_pair: bool = False  # whether only the reference camera of a stereo pair has it
-    entry: str = ""  # entry of `output` that selects it; empty if it is the name
+    entry: str = ""  # entry of `output` that selects it; empty for `name`
 
     @property
     def result(self) -> str:
@@ -83,13 +83,13 @@ class Output(NamedTuple):
         return self.file.replace(FIRST_FRAME, f"{frame:04}")
 
     def count(self, frames: int) -> int:
-        """Return the number of files of a series in a run with a number of frames."""
+        """Return the number of files of a series in a run of `frames` frames."""
         return max(0, frames - self.is_frame_pair)
 
 
-# The outputs, in their order in messages and help; docs/files.md and docs/labels.md describe them. Upper bounds of the
-# size: PNG stores noise uncompressed, a code of a GIF has 12 bits, a pixel of yuv420p has 12 bits before encoding, and
-# a mask has two values. Most pictures take a half or a third of them.
+# The outputs, in their order in messages and help; docs/files.md and docs/labels.md describe them. The bounds of the
+# size are those of noise: PNG stores it uncompressed, GIF in codes of 12 bits, MP4 from yuv420p with 12 bits per pixel;
+# a mask has two values. Most pictures take a half or a third of the bound.
 _ROWS = (
     Output("png", "frames/0000.png", "picture", pixel_bytes=3.01),
     Output("gif", "animation.gif", "picture", pixel_bytes=1.51),
@@ -146,7 +146,7 @@ def result_names(folders: Mapping[str, Collection[str]]) -> list[str]:
     """Return the results of a run, as in `outputs` of run.json: folders of series, files, matrices of cameras, record.
 
     Args:
-        folders: names of the outputs, by the folders of the cameras; "" is the folder of the run.
+        folders: names of the outputs by folder; a folder for each camera, "" for the run (`Scene.folders`).
     """
     selected = [(folder, output) for output in OUTPUTS.values() for folder in folders if output.name in folders[folder]]
     selected.sort(key=lambda item: not item[1].is_series)
@@ -162,8 +162,8 @@ def file_names(results: Iterable[str], frames: int) -> list[str]:
     """Return the paths of the files of a run.
 
     Args:
-        results: results, from `result_names`.
-        frames: number of frames of the run.
+        results: names from `result_names`.
+        frames: frames of the run.
     """
     names: list[str] = []
     for result in results:
@@ -177,8 +177,8 @@ def is_result(results: Collection[str], frames: int, name: str) -> bool:
     """Return whether a path is one of `file_names`, without listing them.
 
     Args:
-        results: results, from `result_names`.
-        frames: number of frames of the run.
+        results: names from `result_names`.
+        frames: frames of the run.
         name: path within the folder of the run.
     """
     folder, _, file = name.rpartition("/")

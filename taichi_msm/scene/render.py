@@ -53,7 +53,7 @@ class Render(Section):
     )
     camera: AnyCamera = key(
         "top",
-        "top: orthographic, from above; oblique: tilted, shows depth; fit: as tilted, and the sheet at rest fills the "
+        "top: orthographic, from above; oblique: tilted, shows depth; fit: as oblique, and the sheet at rest fills the "
         "picture up to a margin of 2 %; or a pinhole camera",
         "top, oblique, fit, or a mapping: {eye: [x, y, z], target: [x, y, z], up: [x, y, z], fov: degrees}, with pose "
         "or poses in place of eye, and intrinsics or calibration in place of fov",
@@ -79,7 +79,7 @@ class Render(Section):
     background: tuple[Byte, Byte, Byte] = key(
         (0, 0, 0), "colour of the background", "three whole numbers, 0 to 255: [red, green, blue]"
     )
-    # At 65 %, a frame of grasp.yaml with 512 x 512 pixels takes 2.5 kB and has 40 dB; in a GIF it takes 35 kB.
+    # At 65 %, a frame of grasp.yaml with 512 x 512 pixels takes 2.5 kB with a PSNR of 40 dB, and 35 kB in a GIF.
     quality: Annotated[Integer, Field(ge=1, le=100)] = key(
         65, "quality of the video of output: mp4 [%]", "a whole number, 1 to 100"
     )
@@ -91,7 +91,7 @@ class Render(Section):
     @classmethod
     def _read_files(cls, camera: AnyCamera, info: ValidationInfo) -> AnyCamera:
         if isinstance(camera, Camera) and camera.beside is not None:
-            raise scene_fault("goes with render.cameras, where the other camera has its name", "beside")
+            raise scene_fault("requires render.cameras, where the reference camera has a name; remove beside", "beside")
         return _read_files(camera, info)
 
     @field_validator("cameras", mode="after")
@@ -100,28 +100,28 @@ class Render(Section):
         if cameras is None:
             return None
         if not cameras:
-            raise scene_fault("has no camera; add one by its name")
+            raise scene_fault("is empty; add a camera under a name")
         for name, camera in cameras.items():
             if not re.fullmatch(CAMERA_NAME, name):
                 raise scene_fault(f"is not a name of a camera; take up to {MAX_CAMERA_NAME} of a-z, 0-9, _ and -", name)
             if name in SERIES_FOLDERS or name.startswith(EXPORT_PREFIX):
-                raise scene_fault("is the name of a folder that is not a camera's; take another name", name)
+                raise scene_fault("is the name of an output folder; take another name", name)
             if name in PRESETS and camera != name:
-                raise scene_fault("is the name of a camera that any scene has; take another name", name)
+                raise scene_fault("is the name of a built-in camera; take another name", name)
             if isinstance(camera, Camera) and camera.beside is not None:
-                _check_beside(name, cameras)
-        read = {}
+                _check_reference_camera(name, cameras)
+        loaded = {}
         for name, camera in cameras.items():
             try:
-                read[name] = _read_files(camera, info)
+                loaded[name] = _read_files(camera, info)
             except PydanticCustomError as error:
                 raise scene_fault(error.message(), name, *(error.context or {}).get("below", ())) from None
-        return read
+        return loaded
 
     @model_validator(mode="before")
     @classmethod
     def _ignore_null(cls, data: Any) -> Any:
-        """Ignore `camera: null`, as an override cannot remove a key."""
+        """Drop `camera: null`, by which an override removes the key."""
         if isinstance(data, Mapping) and data.get("camera", "") is None:
             return {name: value for name, value in data.items() if name != "camera"}
         return data
@@ -129,7 +129,7 @@ class Render(Section):
     @model_validator(mode="after")
     def _check_one_key_of_cameras(self) -> Self:
         if self.cameras is not None and "camera" in self.model_fields_set:
-            raise scene_fault("is given together with cameras; remove one of them, or set it to null", "camera")
+            raise scene_fault("conflicts with cameras; remove one of them, or set it to null", "camera")
         return self
 
     def _unused_keys(self) -> Collection[str]:
@@ -151,16 +151,16 @@ class Render(Section):
         return self.all_cameras[self.main]
 
     def with_main(self, camera: AnyCamera) -> Self:
-        """Return a copy with another main camera. The other camera of a stereo pair follows it."""
+        """Return a copy with another main camera. Cameras with `beside` move with it."""
         if self.cameras is None:
             return self.model_copy(update={"camera": camera})
         return self.model_copy(update={"cameras": {**self.cameras, self.main: camera}})
 
     def origin(self, name: str) -> tuple[AnyCamera, float]:
-        """Return the camera of which a camera with a `baseline` is a translated copy.
+        """Follow the `baseline` of a camera to the camera that it copies.
 
         Returns:
-            That camera, or the camera itself if it is not a copy; the distance between them, along the x axis [m].
+            The copied camera, or the camera itself without `baseline`; its distance along the x axis [m].
         """
         camera, distance = self.all_cameras[name], 0.0
         while isinstance(camera, Camera) and camera.beside is not None and camera.baseline is not None:
@@ -169,13 +169,13 @@ class Render(Section):
         return camera, distance
 
     def companion(self, name: str) -> str:
-        """Return the name of the first camera that is `beside` a camera, or "" if there is none."""
+        """Return the name of the first camera whose `beside` is `name`, or "" without one."""
         cameras = self.all_cameras.items()
         return next((key for key, camera in cameras if isinstance(camera, Camera) and camera.beside == name), "")
 
 
 def _read_files(camera: AnyCamera, info: ValidationInfo) -> AnyCamera:
-    """Return a camera with the contents of its files."""
+    """Return the camera with its calibration and trajectory files read."""
     if not isinstance(camera, Camera):
         return camera
     camera = camera.with_poses()
@@ -183,7 +183,7 @@ def _read_files(camera: AnyCamera, info: ValidationInfo) -> AnyCamera:
     return camera.calibrated(info.data["size"]) if "size" in info.data else camera
 
 
-def _check_beside(name: str, cameras: Mapping[str, AnyCamera]) -> None:
+def _check_reference_camera(name: str, cameras: Mapping[str, AnyCamera]) -> None:
     """Check that the chain of reference cameras of a camera ends at a camera with a pose."""
     if name == next(iter(cameras)):
         raise scene_fault(
@@ -196,7 +196,7 @@ def _check_beside(name: str, cameras: Mapping[str, AnyCamera]) -> None:
             if len(chain) == 1:
                 raise scene_fault(f"{reference} is this camera itself; name another one", name, "beside")
             raise scene_fault(
-                f"the reference cameras form a circle, {', '.join([*chain, reference])}; give one of them an eye",
+                f"the reference cameras form a cycle, {', '.join([*chain, reference])}; give one of them an eye",
                 name,
                 "beside",
             )

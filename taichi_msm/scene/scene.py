@@ -1,4 +1,4 @@
-"""The scene and its section of times; the other sections are in the modules next to this one."""
+"""The scene, and its section `time`; each of the other modules has further sections."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ class Time(Section):
     )
     step: Literal["auto"] | Positive = key(
         "auto",
-        "time step [s], of which a frame is a multiple; auto: half the stability limit or less",
+        "time step [s], a whole fraction of the frame interval; auto: at most half the stability limit",
         "auto, or a number above 0, in seconds",
     )
     tolerance: Tolerance | None = key(
@@ -88,7 +88,7 @@ class Time(Section):
             message = f"a tolerance chooses the step, but step is {self.step:.12g}"
             raise scene_fault(f"{message}; set step: auto or remove the tolerance", "tolerance")
         if self.at_rest and self.tolerance is not None:
-            message = "is for the time step, and motion: quasistatic takes none; remove the tolerance"
+            message = "limits the error of the time step, and motion: quasistatic has none; remove the tolerance"
             raise scene_fault(message, "tolerance")
         if self.at_rest and self.precision == "f32":
             raise scene_fault("f32 is too coarse for motion: quasistatic; take auto or f64", "precision")
@@ -150,7 +150,7 @@ class Scene(Section):
         return folders
 
     def asks_for(self, *sources: str) -> bool:
-        """Return whether any output has one of these sources (see `Output.source`)."""
+        """Return whether any output has one of the sources, values of `Output.source`."""
         return any(OUTPUTS[name].source in sources for name in self.output)
 
     @property
@@ -160,7 +160,7 @@ class Scene(Section):
 
     @property
     def labels_pixels(self) -> bool:
-        """Whether any output consists of ground-truth labels of the pixels."""
+        """Whether any output is a ground-truth label of the pixels."""
         return self.asks_for("labels", "flow", "stereo")
 
     @property
@@ -180,7 +180,7 @@ class Scene(Section):
 
     @property
     def stiffness_map(self) -> StiffnessMap | None:
-        """Map of the stiffness of the springs or the tissue."""
+        """Map of the stiffness of the springs or the tissue; None without one."""
         return self.maps.get("map")
 
     @property
@@ -195,7 +195,7 @@ class Scene(Section):
         return image | {f"{self.kind}.{name}.image": value.image for name, value in self.maps.items()}
 
     def with_pictures(self, path: Callable[[str], str]) -> Scene:
-        """Return a copy of the scene in which `path` maps the paths of the image and the maps to new ones."""
+        """Return a copy with the path p of the image and of each map replaced by `path(p)`."""
         maps = {name: value.model_copy(update={"image": path(value.image)}) for name, value in self.maps.items()}
         image = None if self.image is None else path(self.image)
         material = self.tissue or self.springs

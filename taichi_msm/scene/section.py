@@ -33,17 +33,17 @@ def scene_fault(message: str, *below: str | int) -> PydanticCustomError:
 
     Args:
         message: fault and remedy.
-        below: keys to the value at fault within the validated one; none for that value itself.
+        below: path within the validated value to the faulty one; empty for the validated value itself.
     """
     return PydanticCustomError(SCENE_FAULT, message, {"below": below})
 
 
 def require_increasing(keyframes: Iterable[Sequence[float]]) -> None:
-    """Refuse keyframes whose times, their first numbers, do not increase."""
+    """Raise a fault unless the times of keyframes, their first numbers, increase."""
     for n, ((previous, *_), (time, *_)) in enumerate(pairwise(keyframes), 1):
         if time <= previous:
-            times = f"is at {time:g} s, and the key before it at {previous:g} s"
-            raise scene_fault(f"{times}; sort the keys, each later than the last", n)
+            fault = f"is at {time:g} s, not after the previous keyframe at {previous:g} s"
+            raise scene_fault(f"{fault}; sort the keyframes by time, without equal times", n)
 
 
 def format_value(value: Any) -> str:
@@ -52,32 +52,35 @@ def format_value(value: Any) -> str:
 
 
 def key_problems(error: ValidationError, section: type[BaseModel], data: Any) -> list[Problem]:
-    """Return pydantic's errors as problems at the keys of the scene.
+    """Convert pydantic's errors to problems, each at a key of the scene.
 
     Args:
         error: errors of the validation.
-        section: section that the data was validated against.
+        section: model of the data.
         data: validated data, of plain Python types.
+
+    Returns:
+        Problems in the order of the errors, without duplicates at lists and unions.
     """
     # A broken file of the largest size could have tens of thousands of faults.
     errors = error.errors(include_url=False, include_input=False)[:1000]
-    faults = [_fault(details, section) for details in errors]
-    return [Problem(fault.path, _message(fault, data)) for fault in _drop_short(_choose_kinds(faults))]
+    faults = [_locate(details, section) for details in errors]
+    return [Problem(fault.path, _message(fault, data)) for fault in _merge_missing_items(_choose_members(faults))]
 
 
 class _Fault(NamedTuple):
-    """An error of pydantic, in terms of the scene."""
+    """An error of pydantic, located in the scene."""
 
     path: Key  # to the key at fault
     error: ErrorDetails
     kind: str  # pydantic's type of the error
-    section: type[BaseModel]  # that the key belongs to, or that of the keys below it
+    section: type[BaseModel]  # section of the key, or, for a key that is a section, that section
     field: FieldInfo | None  # of the last key in the path
-    branches: tuple[tuple[Key, str], ...]  # keys that allow several kinds of value, each with the validated kind
+    branches: tuple[tuple[Key, str], ...]  # keys with a union type, each with the member that failed
 
 
-def _fault(error: ErrorDetails, section: type[BaseModel]) -> _Fault:
-    """Translate an error, by its location in the models without pydantic's names of union members."""
+def _locate(error: ErrorDetails, section: type[BaseModel]) -> _Fault:
+    """Locate an error in the scene: its path without pydantic's names of union members."""
     path: Key = ()
     field = None
     branches: tuple[tuple[Key, str], ...] = ()
@@ -87,45 +90,45 @@ def _fault(error: ErrorDetails, section: type[BaseModel]) -> _Fault:
         if part not in section.model_fields:
             continue
         field = section.model_fields[str(part)]
-        kinds = _kinds(field.annotation)
+        kinds = _union_members(field.annotation)
         if get_origin(kinds[0]) is dict:  # a mapping from names
-            kinds = _kinds(get_args(kinds[0])[1])
+            kinds = _union_members(get_args(kinds[0])[1])
             path += tuple(islice(parts, 1))
         if len(kinds) > 1:
             branches += ((path, str(next(parts, ""))),)
-        section = next(_sections(field.annotation), section)
+        section = next(_section_types(field.annotation), section)
     path += error.get("ctx", {}).get("below", ())
     return _Fault(path, error, error["type"], section, field, branches)
 
 
-def _kinds(annotation: Any) -> list[Any]:
-    """List the types of a union without None, or the only type."""
+def _union_members(annotation: Any) -> list[Any]:
+    """Return the members of a union type without None; for another type, a list of it."""
     if get_origin(annotation) not in (Union, UnionType):
         return [annotation]
     return [kind for kind in get_args(annotation) if kind is not type(None)]
 
 
-def _words(annotation: Any, depth: int) -> Iterator[str]:
-    """Iterate over the texts that an annotation allows within lists nested to a depth."""
+def _literals(annotation: Any, depth: int) -> Iterator[str]:
+    """Yield the values of Literals nested in `depth` tuples of an annotation."""
     if get_origin(annotation) is Literal:
         yield from get_args(annotation) if depth == 0 else ()
         return
     for argument in get_args(annotation):
-        yield from _words(argument, depth - (get_origin(annotation) is tuple))
+        yield from _literals(argument, depth - (get_origin(annotation) is tuple))
 
 
-def _sections(annotation: Any) -> Iterator[type[BaseModel]]:
+def _section_types(annotation: Any) -> Iterator[type[BaseModel]]:
     """Iterate over the sections of an annotation such as tuple[Probe, ...]."""
     if isinstance(annotation, type) and get_origin(annotation) is None and issubclass(annotation, BaseModel):
         yield annotation
     for argument in get_args(annotation):
-        yield from _sections(argument)
+        yield from _section_types(argument)
 
 
-def _choose_kinds(faults: Sequence[_Fault]) -> Iterator[_Fault]:
-    """Keep only the faults of the most probable kind of a value that may be of several kinds.
+def _choose_members(faults: Sequence[_Fault]) -> Iterator[_Fault]:
+    """For a value of a union type, keep the faults of the member that the value most probably is.
 
-    That is the kind with the deepest fault; if two faults are equally deep, the value as a whole is at fault.
+    That member has the deepest fault. If two are equally deep, the value as a whole is the fault.
     """
     depths: dict[Key, dict[str, int]] = defaultdict(dict)
     for fault in faults:
@@ -143,8 +146,8 @@ def _choose_kinds(faults: Sequence[_Fault]) -> Iterator[_Fault]:
             yield fault
 
 
-def _drop_short(faults: Iterable[_Fault]) -> Iterator[_Fault]:
-    """Merge the faults of missing items into a fault of their list; drop it if an item of the list is at fault."""
+def _merge_missing_items(faults: Iterable[_Fault]) -> Iterator[_Fault]:
+    """Replace the faults of missing items by one fault of their list, or by none if another item is at fault."""
     merged = [
         fault._replace(path=fault.path[:-1], kind="too_short")
         if fault.kind == "missing" and isinstance(fault.path[-1], int)
@@ -171,9 +174,9 @@ def _message(fault: _Fault, data: Any) -> str:
     context = fault.error.get("ctx", {})
     limit = context.get("ge", context.get("le"))
     if limit in (MAX_MAGNITUDE, -MAX_MAGNITUDE) or (limit == MIN_MAGNITUDE and data > 0):
-        return f"{format_value(data)} is out of range; numbers are from {MIN_MAGNITUDE:g} to {MAX_MAGNITUDE:g} in size"
+        return f"{format_value(data)} is out of range; magnitudes are {MIN_MAGNITUDE:g} to {MAX_MAGNITUDE:g}"
     is_item = isinstance(fault.path[-1], int)
-    hint = did_you_mean(data, _words(fault.field.annotation, is_item)) if isinstance(data, str) else ""
+    hint = did_you_mean(data, _literals(fault.field.annotation, is_item)) if isinstance(data, str) else ""
     return f"{format_value(data)} is not allowed; {expected}{hint}"
 
 
@@ -183,7 +186,7 @@ MAX_PROBES = 16
 MAX_PIXELS = 8192  # width or height of a frame
 MAX_SUPERSAMPLE = 4
 
-# Approximate limit of operating systems for the length of a path.
+# Longest path, about the limit of operating systems.
 MAX_PATH = 4096
 
 # Offset of a probe in the paper (eq. 5).
@@ -192,7 +195,7 @@ DEFAULT_OFFSET = 10.0
 # Times that differ by less than this fraction of a frame are equal, so that 0.1 s at 30 frames/s is 3 frames.
 FRAME_TOLERANCE = 1e-6
 
-# Below the minimum, the error would be comparable to rounding in f64; above the maximum, the result is meaningless.
+# Limits of tolerances: smaller errors are lost in rounding of f64, larger ones make a result meaningless.
 MIN_TOLERANCE = 1e-10
 MAX_TOLERANCE = 0.5
 
@@ -221,7 +224,7 @@ def key(default: Any, description: str, expects: str) -> Any:
 
     Args:
         default: default value; ... for a required key.
-        description: meaning with the unit, for the documentation and the schema.
+        description: meaning and unit, for the documentation and the schema.
         expects: allowed values, for messages after "expected".
     """
     return Field(default, description=description, json_schema_extra={"expects": expects})
@@ -255,8 +258,7 @@ class Section(BaseModel, metaclass=_SectionMeta):
     """Base class of the sections of a scene, which are immutable.
 
     Raises:
-        SceneError: when a key is unknown, missing or invalid, in the constructor and in `model_copy`, and when a key
-            is assigned to.
+        SceneError: when a key is unknown, missing or invalid in the constructor or in `model_copy`; at any assignment.
     """
 
     model_config = ConfigDict(frozen=True, extra="forbid", validate_default=True)
@@ -278,7 +280,7 @@ class Section(BaseModel, metaclass=_SectionMeta):
         return type(self)(**{**{name: getattr(self, name) for name in self.model_fields_set}, **(update or {})})
 
     def _unused_keys(self) -> Collection[str]:
-        """Return the keys that a dump omits, as they would be invalid when the scene is read again."""
+        """Return the keys to omit from a dump, with which the scene could not be read again."""
         return ()
 
     @model_serializer(mode="wrap")

@@ -1,4 +1,4 @@
-"""Sections of the sheet, and of its springs or its tissue."""
+"""Sections of the sheet and its material: springs or tissue."""
 
 from __future__ import annotations
 
@@ -52,11 +52,11 @@ class Sheet(Section):
 
 
 class StiffnessMap(Section):
-    """Map of the stiffness: an image over the whole sheet whose grey values set a factor."""
+    """Image over the whole sheet, whose grey values are factors of the stiffness."""
 
     image: FilePath = key(
         ...,
-        "a picture whose grey values set the stiffness; relative to the scene file, in its folder or below",
+        "path of a picture, whose grey values are factors; relative to the scene file, in its folder or below",
         "the path of a picture",
     )
     range: tuple[Positive, Positive] = key(
@@ -75,9 +75,11 @@ class Springs(Section):
         0.0, "springs from each mass point to its rest position [N/m]", "a number, 0 or more, in N/m"
     )
     virtual_active: Literal["loaded", "always"] = key(
-        "loaded", "when the virtual springs act: while any probe's percent is not 0, or always", "loaded or always"
+        "loaded",
+        "loaded: the virtual springs act while the load of any probe is not 0; always: at all times",
+        "loaded or always",
     )
-    map: StiffnessMap | None = key(None, "map of a factor of structural and shear", "a mapping with image and range")
+    map: StiffnessMap | None = key(None, "map of factors of structural and shear", "a mapping with image and range")
 
 
 class Stiffening(Section):
@@ -95,10 +97,7 @@ class RelaxationBranch(Section):
 
 
 class Foundation(Section):
-    """Elastic (Winkler) foundation: a layer of tissue below the sheet.
-
-    Its stiffness, force per area and displacement, is young / depth.
-    """
+    """Elastic (Winkler) foundation of a layer of tissue: stiffness young / depth, force per area and displacement."""
 
     young: Positive = key(..., "Young's modulus of the tissue below the sheet [Pa]", "a number above 0, in Pa")
     depth: Positive = key(..., "depth of the tissue below the sheet [m]", "a number above 0, in metres")
@@ -115,7 +114,7 @@ class Foundation(Section):
     @model_validator(mode="after")
     def _check_factor(self) -> Self:
         if self.lock is None and "factor" in self.model_fields_set:
-            raise scene_fault("goes with lock; give lock, a depth in metres, or remove factor", "factor")
+            raise scene_fault("requires lock; add lock, a depth in metres, or remove factor", "factor")
         return self
 
 
@@ -129,14 +128,16 @@ class Tissue(Section):
     )
     foundation: NotNegative | Foundation = key(
         0.0,
-        "stiffness of the elastic (Winkler) foundation: force per area and displacement [N/m3], which the virtual "
-        "springs exert; or young / depth of the tissue below the sheet",
+        "stiffness of the elastic (Winkler) foundation, force per area and displacement [N/m3]; or young and depth of "
+        "the tissue below the sheet, with the stiffness young / depth",
         "a number, 0 or more, in N/m3, or {young: [Pa], depth: [m]}",
     )
     foundation_active: Literal["loaded", "always"] = key(
-        "loaded", "when the foundation acts: while any probe's percent is not 0, or always", "loaded or always"
+        "loaded",
+        "loaded: the foundation acts while the load of any probe is not 0; always: at all times",
+        "loaded or always",
     )
-    damping: NotNegative = key(0.0, "C / m [1/s]", "a number, 0 or more, in 1/s")
+    damping: NotNegative = key(0.0, "damping per mass, C / m [1/s]", "a number, 0 or more, in 1/s")
     pretension: NotNegative = key(
         0.0, "tension S of the sheet at rest [N/m]; all sides must be fixed or clamped", "a number, 0 or more, in N/m"
     )
@@ -146,21 +147,21 @@ class Tissue(Section):
         "plate, or a number, 0 or more, in N m",
     )
     stiffening: Stiffening | None = key(
-        None, "sheet that locks when it is stretched", "a mapping: {lock: [a strain], factor: [default 10]}"
+        None, "stiffness that grows with the strain", "a mapping: {lock: [a strain], factor: [default 10]}"
     )
     relaxation: tuple[RelaxationBranch, ...] = key(
         (),
-        "stress relaxation of all elastic forces, in up to 4 branches with shares below 1 in all; a foundation must "
-        "always be active",
+        "stress relaxation of all elastic forces, in up to 4 branches, whose shares sum to less than 1; a foundation "
+        "must always be active",
         "a list of up to 4 mappings: [{share: [0 to 1], time: [s]}, ...]",
     )
-    map: StiffnessMap | None = key(None, "map of a factor of young", "a mapping with image and range")
+    map: StiffnessMap | None = key(None, "map of factors of young", "a mapping with image and range")
     foundation_map: StiffnessMap | None = key(
-        None, "map of a factor of the foundation", "a mapping with image and range"
+        None, "map of factors of the foundation", "a mapping with image and range"
     )
 
     @property
     def foundation_stiffness(self) -> float:
-        """Stiffness of the foundation, where its map has the factor 1 [N/m3]."""
+        """Stiffness of the foundation before its map of factors [N/m3]."""
         foundation = self.foundation
         return foundation.young / foundation.depth if isinstance(foundation, Foundation) else foundation

@@ -27,7 +27,7 @@ from taichi_msm.scene.section import (
 
 
 class Instrument(Section):
-    """Metal tool, which touches the sheet if it is position-controlled, and is only drawn otherwise."""
+    """Solid of a tool: it touches the sheet if the tool is position-controlled, and is only drawn otherwise."""
 
     model_config = ConfigDict(json_schema_extra={"oneOf": [{"required": ["radius"]}, {"required": ["plate"]}]})
 
@@ -54,7 +54,7 @@ class Instrument(Section):
     @classmethod
     def _check_not_zero(cls, shaft: Vector) -> Vector:
         if not any(abs(number) >= MIN_MAGNITUDE for number in shaft):
-            raise scene_fault("has no direction; take one such as [0.3, -0.5, 1]")
+            raise scene_fault("is 0 and has no direction; take one such as [0.3, -0.5, 1]")
         return shaft
 
     @model_validator(mode="after")
@@ -62,25 +62,25 @@ class Instrument(Section):
         if self.radius is None and self.plate is None:
             raise scene_fault("missing; expected a number above 0, in metres; or plate, for a flat end", "radius")
         if self.radius is not None and self.plate is not None:
-            raise scene_fault("does not go with radius, of a round end; remove one of them", "plate")
+            raise scene_fault("conflicts with radius, for a round end; remove one of them", "plate")
         return self
 
     def _unused_keys(self) -> Collection[str]:
         return ("radius",) if self.radius is None else ("plate",)
 
 
-# Keys that only a force-controlled tool has, and those that only a position-controlled tool has.
+# Keys of force-controlled tools only, and of position-controlled tools only.
 _FORCE_KEYS = {"at", "total", "force", "load", "falloff", "radius", "offset"}
 _PATH_KEYS = {"friction", "grip"}
 
-# Keyframes of a path: t [s], across, down, height [m], of a clamp t [s], x, y, z [m]; and of a control point: t [s],
-# across, down.
+# Keyframes: of a path [t, across, down, height], of the path of a clamp [t, x, y, z], and of a control point
+# [t, across, down]; t [s], height, x, y and z [m], across and down as fractions of the sheet.
 PathKeyframe = tuple[Number, Number, Number, Number]
 PointKeyframe = tuple[Number, SheetFraction, SheetFraction]
 
 _PATH_EXPECTS = (
-    "keys [[t, across, down, height], ...], t in seconds, across and down from -1 to 2, height in metres; or, with "
-    "clamp, keys [[t, x, y, z], ...] in seconds and metres"
+    "keyframes [[t, across, down, height], ...], t in seconds, across and down from -1 to 2, height in metres; or, "
+    "with clamp, [[t, x, y, z], ...] in seconds and metres"
 )
 
 
@@ -103,16 +103,16 @@ class Probe(Section):
     )
     path: Annotated[tuple[PathKeyframe, ...], Field(min_length=1)] | None = key(
         None,
-        "in place of a force: position of the instrument; keyframes [[t, across, down, height], ...], linear between, "
-        "constant outside; height: of the lowest point of its tip above the sheet at rest [m]; of a clamp its "
-        "displacement, keyframes [[t, x, y, z], ...] [m], the first one [0, 0, 0, 0]",
+        "in place of a force: keyframes [[t, across, down, height], ...] of the instrument's tip, height of its lowest "
+        "point above the sheet at rest [m]; or keyframes [[t, x, y, z], ...] of the displacement of a clamp [m], the "
+        "first one [0, 0, 0, 0]; linear between, constant outside",
         _PATH_EXPECTS,
     )
     at: tuple[SheetFraction, SheetFraction] | Annotated[tuple[PointKeyframe, ...], Field(min_length=1)] = key(
         (0.5, 0.5),
-        "control point: fraction of the width from the left, of the height from the top; "
-        "or keyframes [[t, across, down], ...], linear between, constant outside",
-        "[across, down], fractions from -1 to 2, or keys [[t, across, down], ...]",
+        "control point: across from the left, as a fraction of the width, down from the top, of the height; "
+        "or its keyframes [[t, across, down], ...], linear between, constant outside",
+        "[across, down], fractions from -1 to 2, or keyframes [[t, across, down], ...]",
     )
     total: Vector | None = key(
         None, "total force of the tool on a wide sheet at 100 % [N]", "three numbers: [x, y, z] in newtons"
@@ -126,7 +126,7 @@ class Probe(Section):
         ((0.0, 100.0),),
         "keyframes [t, percent], linear between; 0 before the first, the last value after the last; "
         "two keyframes at the same time are a jump",
-        "keys [[t, percent], ...], t in seconds",
+        "keyframes [[t, percent], ...], t in seconds",
     )
     falloff: NotNegative = key(
         150.0,
@@ -138,12 +138,12 @@ class Probe(Section):
     )
     offset: Annotated[Number, Field(ge=-50, le=1000)] = key(
         DEFAULT_OFFSET,
-        "with force only: subtracted in the exponent of the decay, so also at the control point",
+        "with force only: number subtracted in the exponent of the decay, everywhere",
         "a number, -50 to 1000",
     )
     instrument: Instrument | None = key(
         None,
-        "solid that is drawn for the tool; with path it touches the sheet, and is required",
+        "solid of the tool, which is drawn; required with path, where it touches the sheet",
         "a mapping with radius or plate, shaft and length",
     )
     friction: Literal["rough"] | NotNegative = key(
@@ -172,10 +172,10 @@ class Probe(Section):
         if force is None and total is None and info.data["path"] is None and info.data["clamp"] is None:
             raise scene_fault(
                 "missing; expected total (whole tool) or, with springs, force (one point): [x, y, z] in newtons; or "
-                "path, for a tool that is moved"
+                "path, for a position-controlled tool"
             )
         if force is not None and total is not None:
-            raise scene_fault("is given together with total; remove one of them")
+            raise scene_fault("conflicts with total; remove one of them")
         return force
 
     @field_validator("falloff", "offset", mode="after")
@@ -185,7 +185,7 @@ class Probe(Section):
             if info.field_name == "falloff" and value < MIN_MAGNITUDE:
                 raise scene_fault(f"{value:g} would spread total over an infinite area; take a number above 0, in 1/m")
             if info.field_name == "offset" and value != DEFAULT_OFFSET:
-                raise scene_fault("goes with force, not with total; remove offset")
+                raise scene_fault("requires force, and total is given; remove offset")
         return value
 
     @field_validator("at", "load", mode="after")
@@ -197,11 +197,12 @@ class Probe(Section):
         for n in range(1, len(times)):
             if times[n] < times[n - 1]:
                 raise scene_fault(
-                    f"goes back in time, from {times[n - 1]:g} s to {times[n]:g} s; sort the keys by time", n
+                    f"is at {times[n]:g} s, the previous keyframe at {times[n - 1]:g} s; sort the keyframes by time",
+                    n,
                 )
             if n > 1 and times[n] == times[n - 2]:
                 raise scene_fault(
-                    f"third key at {times[n]:g} s; a jump is two keys at one time, so remove the middle one", n
+                    f"third keyframe at {times[n]:g} s; a jump has two keyframes at one time, remove the middle one", n
                 )
         return keyframes
 
@@ -222,10 +223,10 @@ class Probe(Section):
     def _check_grips_are_separate(cls, grip: tuple[tuple[float, float], ...]) -> tuple[tuple[float, float], ...]:
         for n, (begin, end) in enumerate(grip):
             if end <= begin:
-                raise scene_fault(f"ends at {end:g} s, and begins at {begin:g} s; give [from, to] in this order", n)
+                raise scene_fault(f"ends at {end:g} s, and begins at {begin:g} s; write [from, to] in this order", n)
             if n and begin < grip[n - 1][1]:
                 raise scene_fault(
-                    f"begins at {begin:g} s, before the grip before it ends; sort them, without overlap", n
+                    f"begins at {begin:g} s, before the previous grip ends; sort the grips, without overlap", n
                 )
         return grip
 
@@ -234,19 +235,19 @@ class Probe(Section):
         given = self.model_fields_set
         if self.clamp is not None:
             if self.path is None:
-                raise scene_fault("missing; with clamp expected keys [[t, x, y, z], ...], t in seconds", "path")
+                raise scene_fault("missing; with clamp expected keyframes [[t, x, y, z], ...], t in seconds", "path")
             for name in sorted((_FORCE_KEYS | _PATH_KEYS | {"instrument"}) & given):
                 if getattr(self, name) not in (None, 0.0, ()):
-                    raise scene_fault("does not go with clamp, which has a path only; remove one of them", name)
+                    raise scene_fault("conflicts with clamp, which has only a path; remove one of them", name)
             return self
         if self.path is None:
             for name in _PATH_KEYS & given:
                 if getattr(self, name):
-                    raise scene_fault("goes with path; a tool with a force has none", name)
+                    raise scene_fault(f"requires path; remove {name} from a tool with a force", name)
             return self
         for name in sorted(_FORCE_KEYS & given):
             if getattr(self, name) is not None:
-                raise scene_fault("goes with a force, and path gives the place; remove one of them", name)
+                raise scene_fault("requires a force, and path replaces it; remove one of them", name)
         if self.instrument is None:
             raise scene_fault("missing; with path expected a mapping with radius, shaft and length", "instrument")
         return self
