@@ -11,8 +11,8 @@ from taichi_msm.system import process
 
 def main() -> int:
     """Run the command line, and return its exit code."""
-    # Imports create half a million permanent objects. At the default threshold, the garbage collector takes 5 % of a
-    # short run to search them.
+    # Imports create half a million permanent objects. At the default threshold, their garbage collection takes 5 % of a
+    # short run.
     gc.set_threshold(100_000)
     # PYTHONWARNINGS=error is for a user's own code; a warning in a library must not end a command or a child process.
     if any(option and "error".startswith(option.partition(":")[0]) for option in sys.warnoptions):

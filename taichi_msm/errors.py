@@ -105,11 +105,11 @@ class FilesError(MsmError):
 
 
 class ForeignError(FilesError):
-    """A file or folder that no run has written is at the path of a result; it was not changed."""
+    """A foreign file or folder, not written by this program, is at the path of a result. It is unchanged."""
 
     @classmethod
     def at(cls, path: object, kind: str) -> ForeignError:
-        """Build the error for an entry in the way of a result.
+        """Build the error for a foreign entry at the path of a result.
 
         Args:
             path: path of the entry.
@@ -118,7 +118,7 @@ class ForeignError(FilesError):
         Returns:
             The error, to be raised.
         """
-        return cls(f"{path}: {kind} that no run has put there; move it away or choose another folder")
+        return cls(f"{path}: {kind} not written by this program; move it away or choose another folder")
 
 
 class DamagedError(FilesError):
@@ -160,7 +160,7 @@ def writing(path: object, option: str = "--out") -> Iterator[None]:
 
     Args:
         path: file or folder that the block writes to, for the message.
-        option: command-line option that selects another one, for the remedy.
+        option: command-line option of the path, for the remedy.
 
     Raises:
         FilesError: in place of the OSError; contains its reason and the remedy.

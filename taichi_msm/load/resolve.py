@@ -41,7 +41,7 @@ def resolve(plan: Plan, device: Device, progress: ProgressCallback = lambda done
     """
     estimate = mesh = None
     plan = planning.choose_precision(plan, device.arch)
-    # On a CPU, `auto` may have chosen another precision.
+    # The plan was checked for a CPU, where `auto` may choose another precision.
     if problems := [str(problem) for problem in planning.precision_problems(plan)]:
         raise SceneError(problems)
     if plan.scene.sheet.tolerance is not None:

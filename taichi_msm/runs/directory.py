@@ -1,14 +1,18 @@
 """Atomic replacement of files and of all results in a directory.
 
-New results are written to `.partial/new` inside the directory. The publication is committed when this folder, complete,
-is renamed to `.partial/whole`. Then the record of the earlier results is moved aside, the new files are moved into
-place, obsolete files are deleted, and the new record is moved last. A directory with a record therefore always contains
-complete and consistent results. If the process is killed before the commit, the directory is unchanged; after it, the
-next publication completes the moves.
+A publication has three steps:
 
-The record lists the files of a publication, and only listed files are replaced or deleted. Any other entry in the way,
-such as a link or a device, is an error, raised before anything is changed. A folder is checked when work in it begins;
-later, files are created exclusively. Processes that can write to the directory during a run are trusted.
+1. Write the new results to `.partial/new` inside the directory.
+2. Commit: rename this folder to `.partial/whole`.
+3. Move the record of the earlier results aside, and the new files into place. Delete obsolete files. Move the new
+   record into place, last.
+
+So a directory with a record contains complete and consistent results. A process killed before the commit leaves the
+directory unchanged; after the commit, the next publication completes step 3.
+
+The record lists the files of a publication, and only listed files are replaced or deleted. A foreign entry at the path
+of a result, such as a link or a device, is an error before any change. Folders are checked when a publication begins;
+from then on, files are created exclusively. Processes with write access to the directory during a run are trusted.
 
 Single files are replaced atomically, too: they are written to a hidden folder next to their destination and renamed.
 """
@@ -46,12 +50,12 @@ class PublicationSpec(NamedTuple):
     record: str  # name of the file that lists the others
     patterns: Collection[str]  # of all files that may be published, including the record
     read_record: Callable[[Mapping[str, Any]], IsListed]  # converts a record to a predicate of file names
-    exclusive: bool = False  # whether the directory may not contain other files
-    companion: tuple[str, Collection[str]] | None = None  # a folder that stays unpublished, and its patterns
+    exclusive: bool = False  # whether other files in the directory are errors
+    companion: tuple[str, Collection[str]] | None = None  # an unpublished folder, and patterns of its files
 
 
 class Publication:
-    """Publication of new files in a directory, as a context manager. Without `publish`, they are discarded at exit.
+    """Publication of new files in a directory: a context manager that discards them at exit, except after `publish`.
 
     Args:
         directory: destination; created if missing.
@@ -116,7 +120,7 @@ class Publication:
         return self
 
     def __exit__(self, *_: object) -> None:
-        # The next publication repeats a cleanup that fails; an exception in flight takes precedence.
+        # Errors are ignored: the next publication repeats the cleanup, and an exception of the block has precedence.
         with suppress(OSError, FilesError):
             self._complete()
             self._clear()
@@ -141,9 +145,9 @@ class Publication:
             raise ValueError("no record") from error
 
     def _require_free(self, names: Collection[str], earlier: set[str]) -> None:
-        """Raise an error unless all folders are writable, and all names are free or those of earlier results."""
+        """Require writable folders, and at the paths of new files nothing or files of earlier results."""
         for folder in sorted(parent_folders(names)):
-            # Checked here, so that it fails before the run and not during the moves.
+            # An unwritable folder is an error here, before the run, not later during the moves.
             path = require_kind(self._directory / folder, FOLDER)
             if entry_kind(path) is not None and not os.access(path, os.W_OK):
                 raise PermissionError(errno.EACCES, f"{folder} is not a writable directory")
@@ -251,7 +255,7 @@ def require_kind(path: Path, wanted: str) -> Path:
 
 
 def require_no_link(folder: Path, option: str) -> Path:
-    """Require that a default folder is not a link, which may have come with the scene.
+    """Require that a default folder is not a symbolic link, possibly of an untrusted scene.
 
     Args:
         folder: the folder, which may be missing.
@@ -395,7 +399,7 @@ def link_without_replacing(draft: Path, path: Path) -> bool:
 
     Args:
         draft: the file, on the same file system.
-        path: the new path; an existing file is not replaced, except without links in a race with another process.
+        path: the new path. An existing file is kept, except in a race on a file system without links.
 
     Returns:
         Whether the path was free.

@@ -62,7 +62,7 @@ class Palette:
         self._background = background
         self._lookup = Image.new("P", (1, 1))
         # Pillow maps each cell of 4 x 4 x 4 colours to the palette entry nearest to the cell's darkest corner. With a
-        # palette that is half a cell darker it is the entry nearest to the cell's centre, which saves 0.8 dB of error.
+        # palette darker by half a cell, it is the entry nearest to the cell's centre: 0.8 dB less error.
         self._lookup.putpalette((np.maximum(colours, 2) - 2).tobytes())
 
     def indices(self, picture: Picture) -> Picture:
@@ -92,7 +92,7 @@ class GifWriter:
         self._palette = palette
         self._frames = 0
         self._latest: Picture | None = None
-        # Start times [1/100 s] and palette indices. Two frames are queued, because a short last one shortens the other.
+        # Start times [1/100 s] and palette indices. Two are queued, because a short last frame shortens the other.
         self._queue: deque[tuple[int, Picture]] = deque()
         self._screen: Picture | None = None
         self._file = file

@@ -277,7 +277,7 @@ _LABEL_WRITERS: dict[str, Callable[[BinaryIO, Any], None]] = {
     ".npy": np.save,
     ".tiff": lambda file, depth: Image.fromarray(depth).save(file, "TIFF"),
     ".flo": write_flo,
-    # Masks consist of few large areas.
+    # Level 1 suffices, as masks consist of few large areas.
     ".png": lambda file, mask: Image.fromarray(mask).save(file, "PNG", compress_level=1),
 }
 
@@ -303,10 +303,10 @@ class RunRecord(TypedDict, total=False):
     error: str  # location and cause of the divergence; only if diverged
     dump: str | None  # file with the last valid state, None if there is none; only if diverged
     scene: dict[str, Any]  # as simulated, with resolved mesh, step and precision
-    asked: dict[str, Any]  # requested values that were resolved to others, by the paths of their keys
+    asked: dict[str, Any]  # requested values that differ from the resolved ones, by dotted key
     working_directory: str  # folder to which picture paths are relative
-    # Digests of the files of picture and maps by their keys in the scene, such as image and tissue.map.image. An
-    # unreadable picture that was not drawn is omitted.
+    # Digests of picture, map and camera files by scene key, such as image and tissue.map.image. An unreadable picture
+    # that is not drawn is omitted.
     sha256: dict[str, str]
     overrides: list[str]  # of the scene file
     points: list[int]  # rows and columns of mass points
@@ -333,6 +333,6 @@ class RunRecord(TypedDict, total=False):
     lanes: int  # number of SIMD lanes used for stepping; 1 on a GPU
     workers: int  # number of threads used for stepping; 0 on a GPU
     versions: dict[str, str]  # of all software that affects the results
-    commit: str | None  # of the program, by git; None if it does not run from a clone
+    commit: str | None  # git commit of the program; None without a clone
     frames: int
     outputs: list[str]  # names of files, and of folders with a file per frame

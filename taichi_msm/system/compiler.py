@@ -36,7 +36,7 @@ class Compiler:
     cache: str  # directory of compiled kernels, relative to the home directory
     lock: str  # lock file of the cache, relative to that directory
     tested_version: str  # version whose results on a CPU have the same bits as those of the other compiler
-    python_versions: str  # python versions for which it can be installed
+    python_versions: str  # versions of Python with wheels of it
     # Time to poll a counter that another thread writes [s], measured on Zen 4; Taichi fences the read by `mfence`,
     # Quadrants by a locked `or`.
     poll_s: float
@@ -94,11 +94,11 @@ class Compiler:
 
     @cached_property
     def patches(self) -> Patches:
-        """Patches that are applied while a kernel of this package is parsed; empty for an untested version.
+        """Patches for faster parsing of the kernels of this package; empty for an untested version.
 
-        They omit the source lines that a compiler prepares for error messages at every node, and find the source of a
-        function once, not for each of its calls. It parses all kernels in every process, because the keys of its cache
-        depend on the parsed kernels.
+        A compiler parses all kernels in every process, because the keys of its cache depend on the parsed kernels.
+        Patched, it looks up the source of a function once, not at every call, and omits the source lines that it
+        prepares for error messages at every node.
         """
         if "TAICHI_MSM_TRACEBACK" in os.environ or self.version != self.tested_version:
             return []
@@ -115,7 +115,7 @@ class Compiler:
                 (reader, "build_stmt", read),
                 (sources, "getsourcefile", cache(sources.getsourcefile)),
                 (sources, "getsourcelines", cache(sources.getsourcelines)),
-                # Taichi wraps every line into itself.
+                # Taichi wraps every line at 9999 columns, which only strips it at the end.
                 (sources, "textwrap", SimpleNamespace(fill=lambda line, **_: line.rstrip(), dedent=textwrap.dedent)),
             ]
         kernels = import_module("quadrants.lang.kernel")

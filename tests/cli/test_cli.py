@@ -581,4 +581,4 @@ def test_a_cache_that_has_no_room_is_not_used(
     room = SimpleNamespace(f_files=files, f_favail=left, f_bavail=blocks, f_frsize=4096)
     monkeypatch.setattr(os, "statvfs", lambda folder: room, raising=False)
     monkeypatch.setenv(FOLDER, str(tmp_path))
-    assert (runtime._cache() == {}) == kept
+    assert (runtime._cache_options() == {}) == kept
