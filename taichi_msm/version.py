@@ -17,7 +17,7 @@ def commit() -> str | None:
     if not folder.exists():
         return None
     try:
-        # By default, git also searches the parent folders, which may be a clone of another project.
+        # Without --git-dir, git also searches the parent folders, and may find another project.
         git = ["git", f"--git-dir={folder}", "rev-parse", "--verify", "HEAD"]
         return subprocess.run(git, capture_output=True, text=True, check=True).stdout.strip()
     except (OSError, subprocess.CalledProcessError):

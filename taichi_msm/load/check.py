@@ -76,7 +76,7 @@ def _with_file(problem: Problem, data: dict[str, Any]) -> Problem:
 def _check_combinations(
     scene: Scene, maps: Maps | None = None, *, with_image: bool = True
 ) -> tuple[Plan | None, list[Problem]]:
-    """Plan a scene, and check combinations of its keys; `with_image` also checks the image file."""
+    """Plan a scene, and check combinations of its keys; with `with_image`, also the image file."""
     plan, problems = try_plan(scene, maps)
     problems += camera_problems(scene)
     if "mp4" in scene.output and not outputs.is_pyav_installed():

@@ -162,8 +162,8 @@ def require_disk(plan: Plan, directory: Path) -> None:
     """Require that a disk has enough free space for a run.
 
     Args:
-        plan: plan of the run.
-        directory: destination of the results, which need not exist.
+        plan: plan of the run; determines the files.
+        directory: destination of the results; may be missing.
 
     Raises:
         SceneError: when an upper bound of the files exceeds the free space; names the key with the largest share.
@@ -230,7 +230,7 @@ class DurationEstimate(NamedTuple):
     """Estimated duration of a run [s]."""
 
     seconds: float
-    start: float  # part of it before the first step
+    start: float  # share before the first step [s], included in `seconds`
 
 
 def estimate_duration(plan: Plan) -> DurationEstimate:

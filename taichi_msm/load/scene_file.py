@@ -114,7 +114,7 @@ def plan_file(
     """Validate a parsed scene file, and plan the scene for a CPU.
 
     Args:
-        file: the parsed file.
+        file: scene file from `read_file`.
         overrides: as for `load_scene`.
         image: as for `load_scene`.
 
@@ -249,7 +249,7 @@ class Draft:
         Recorded as problems: a path outside the folder, except from an override, and a missing camera file.
 
         Args:
-            key: key whose value is the path; other values are left to validation.
+            key: key of the path; values other than a text are ignored, for validation.
             folder: folder of the scene file, to which the path is relative.
         """
         section, path = value_at(self.data, key[:-1]), value_at(self.data, key)
@@ -333,13 +333,13 @@ def is_below(path: Path, folder: Path) -> bool:
     """Return whether a path, with symbolic links resolved, is inside a folder or the folder itself.
 
     Args:
-        path: any path, which need not exist.
-        folder: the folder; both paths are relative to the current directory.
+        path: path relative to the current directory, possibly missing.
+        folder: path relative to the current directory.
     """
     try:
         return path.resolve().is_relative_to(folder.resolve())
     except (OSError, RuntimeError, ValueError):
-        # For a loop of links or an invalid path, reading the file raises an error.
+        # A loop of links or an invalid path: reading the file later raises the error.
         return True
 
 
@@ -347,7 +347,7 @@ def read_file(name: str, kind: FileKind) -> ParsedFile:
     """Read and parse a YAML file of an expected kind.
 
     Args:
-        name: path of the file, as in messages.
+        name: path of the file, relative to the current directory; also the name in messages.
         kind: name and required keys of such a file, for messages.
 
     Returns:

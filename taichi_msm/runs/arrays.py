@@ -64,8 +64,8 @@ def read_array(archive: zipfile.ZipFile, name: str, dtype: DTypeLike, shape: Sha
     Args:
         archive: open .npz archive.
         name: name of the array, without ".npy".
-        dtype: expected dtype.
-        shape: expected shape.
+        dtype: expected dtype, with byte order.
+        shape: expected shape, in C order.
 
     Returns:
         The array, read-only.
@@ -128,10 +128,10 @@ def map_array(path: Path, name: str, dtype: DTypeLike, shape: Shape) -> NDArray[
 
 
 def _find_entry(archive: zipfile.ZipFile, name: str, dtype: DTypeLike, shape: Shape) -> zipfile.ZipInfo:
-    """Find the entry of an array; raise a ValueError unless it is uncompressed and of the expected size."""
+    """Find the entry of an array; raise a ValueError if it is compressed or not of the expected size."""
     info = archive.getinfo(f"{name}.npy")
     size = len(_npy_header(dtype, shape)) + math.prod(shape) * np.dtype(dtype).itemsize
-    # Compressed data could expand to any size, whatever the header states.
+    # Compressed data could expand beyond the size in the header.
     if info.compress_type != zipfile.ZIP_STORED or (info.file_size, info.compress_size) != (size, size):
         raise ValueError(name)
     return info
@@ -160,7 +160,7 @@ def read_flo(path: Path, size: tuple[int, int]) -> NDArray[np.float32]:
     """Read optical flow from a .flo file.
 
     Args:
-        path: the file.
+        path: .flo file, possibly untrusted.
         size: expected width and height [px].
 
     Returns:

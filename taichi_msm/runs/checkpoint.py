@@ -126,7 +126,7 @@ def read_manifest(directory: Path) -> tuple[Manifest, Plan]:
     try:
         with file, zipfile.ZipFile(file) as archive:
             manifest = _MANIFEST_ADAPTER.validate_python(json.loads(_manifest_bytes(archive)))
-        # The current directory may be another one.
+        # The current directory may differ from that of the original process.
         manifest = replace(manifest, scene=manifest.scene.with_pictures(partial(os.path.join, manifest.folder)))
     except Exception:  # zipfile raises almost any type for a forged archive
         if path.with_name("manifest.json").exists():
@@ -186,8 +186,8 @@ class Checkpoint:
     """Checkpoint folder of a run. It stays valid whenever the process is killed.
 
     Args:
-        folder: the folder; `begin` creates it.
-        plan: the plan of the run.
+        folder: path inside the staging folder; `begin` creates it.
+        plan: plan of the run; determines shapes and dtypes of the parts.
 
     Raises:
         DamagedError: from the methods that read, when a part is damaged; the message names the part.
@@ -233,7 +233,7 @@ class Checkpoint:
         self._state_path.unlink(missing_ok=True)
 
     def reopen(self) -> Snapshot | None:
-        """Open the checkpoint of an earlier run; return its last saved state, None to continue from the first frame."""
+        """Open the checkpoint of an earlier run; return its last saved state, or None for the initial state."""
         self.close()
         saved = self.load()
         self.frames = 0 if saved is None else saved.progress.frame + 1

@@ -224,7 +224,7 @@ FILE, FOLDER = "a file", "a folder"
 
 
 def entry_kind(path: Path) -> str | None:
-    """Return the kind of a directory entry, which may be a link: FILE, FOLDER or a description; None if missing."""
+    """Return the kind of a directory entry: FILE, FOLDER or a description, such as of a link; None if missing."""
     try:
         mode = path.lstat().st_mode
     except FileNotFoundError:
@@ -240,7 +240,7 @@ def require_kind(path: Path, wanted: str) -> Path:
     """Require that an entry is of the expected kind, or missing.
 
     Args:
-        path: path of the entry.
+        path: entry of a directory; links are not followed.
         wanted: expected kind, FILE or FOLDER.
 
     Returns:
@@ -258,7 +258,7 @@ def require_no_link(folder: Path, option: str) -> Path:
     """Require that a default folder is not a symbolic link, possibly of an untrusted scene.
 
     Args:
-        folder: the folder, which may be missing.
+        folder: default destination, which may be missing.
         option: command-line option that selects another folder, for the remedy.
 
     Returns:
@@ -280,9 +280,9 @@ def list_files(top: Path, patterns: Collection[str], *, strict: bool, ignored: C
     """List the files below a folder whose relative paths match a pattern. Links are not followed.
 
     Args:
-        top: the folder.
+        top: root of the relative paths.
         patterns: regular expressions of relative paths; their parts before slashes match the subfolders.
-        strict: whether other entries are errors.
+        strict: whether entries without a match are errors.
         ignored: names of entries to ignore.
 
     Returns:
@@ -418,7 +418,7 @@ def create_file(path: Path, buffering: int = -1) -> BinaryIO:
     """Create a file and open it for writing and reading.
 
     Args:
-        path: path of the file.
+        path: new path in an existing folder.
         buffering: size of the buffer [bytes], as for `open`; -1 for its default, 0 for none.
 
     Returns:
@@ -434,8 +434,8 @@ def write_new_file(path: Path, data: bytes) -> None:
     """Create a file with its content.
 
     Args:
-        path: path of the file.
-        data: the content.
+        path: new path in an existing folder.
+        data: content of the file.
 
     Raises:
         FileExistsError: when the path exists.
@@ -466,7 +466,7 @@ def _try_lock(file: BinaryIO) -> bool:
             msvcrt.locking(file.fileno(), msvcrt.LK_NBLCK, 1)
         else:
             fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except (BlockingIOError, PermissionError) as error:  # the latter on Windows
+    except (BlockingIOError, PermissionError) as error:  # PermissionError on Windows
         raise BlockingIOError(*error.args) from None
     except OSError:
         return False

@@ -76,7 +76,7 @@ class FinishedRun:
 
         Args:
             key: entry of `output` that wrote the picture, such as "png".
-            frame: index of the frame.
+            frame: index, from 0.
 
         Returns:
             Colours, shape (height, width, 3).
@@ -95,7 +95,7 @@ class FinishedRun:
 
     @contextmanager
     def unchanged(self) -> Iterator[None]:
-        """Return a context that raises a FilesError if another run replaces the results meanwhile."""
+        """Return a context that raises a FilesError if another run replaces the results inside the block."""
         try:
             yield
         except MsmError:
@@ -149,7 +149,7 @@ class FinishedRun:
 
         Args:
             key: entry of `output`.
-            frame: index of the frame, if the entry writes a file per frame.
+            frame: index, from 0; ignored for entries with one file for all frames.
 
         Raises:
             FilesError: when the file is missing or is not a regular file of the run.

@@ -35,7 +35,7 @@ TRANSPARENT_INDEX = PALETTE_SIZE
 def predict_colours(picture: Picture) -> Picture:
     """Predict typical colours of an animation, shape (n, m, 3), from its first frame, shape (height, width, 3)."""
     # A grid of at most 48 pixels per axis, at several brightnesses: the first frame shows the sheet at rest; later,
-    # parts of it turn toward the headlight or away from it.
+    # parts of the sheet turn toward the headlight or away.
     stride = -(-max(picture.shape) // 48)
     samples = picture[::stride, ::stride].astype(np.float32)
     brightnesses = (1.0, 1.0, 1.0, 1.0, 1.15, 1.3, 0.8, 0.6, 0.35, 0.15)

@@ -178,7 +178,7 @@ def resume(
     Raises:
         SceneError: when the scene's picture or a map cannot be decoded.
         DeviceError: when the arch is not available.
-        FilesError: when there is no run to resume or it is damaged; and as for `run`.
+        FilesError: when the unfinished run is missing or damaged; and as for `run`.
         KeyboardInterrupt: when interrupted before another frame is finished; nothing has changed then.
     """
     stopwatch = Stopwatch(started)
@@ -481,7 +481,7 @@ def _requested_values(given: Scene, scene: Scene) -> dict[str, Any]:
 
 
 def _pixels_per_metre(scene: Scene) -> float | None:
-    """Return the image scale at the centre of the sheet [px/m]; None without pictures or outside of them."""
+    """Return the image scale at the centre of the sheet [px/m]; None without pictures or with the centre outside."""
     if not scene.renders:
         return None
     centre, right, up = view_at(scene, 0.0, next(iter(scene.render.all_cameras))).pixels(

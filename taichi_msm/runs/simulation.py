@@ -126,7 +126,7 @@ class Simulation:
 
     @property
     def inconsistent(self) -> bool:
-        """Whether an interruption within steps left the state inconsistent; `restore` or `restart` repair it."""
+        """Whether the state is inconsistent after an interruption within steps; `restore` or `restart` repair it."""
         return self._dynamics.inconsistent
 
     @property
@@ -166,12 +166,12 @@ class Simulation:
         """Replace the loads and tool paths from the current time on.
 
         Args:
-            probes: one entry per probe of the scene: the probe with new values, or None to keep it. A control point
-                keeps its kind of motion (moving, jumping or fixed); a force-controlled tool that will move later needs
-                keyframes in `at` from the start. A position-controlled tool takes
-                `{"path": [[t, across, down, height], ...]}` with times after `time` and moves straight from its current
-                position to the first keyframe. Its instrument, friction and grips are kept unless replaced; a grip in
-                progress continues if the new grips contain its beginning.
+            probes: one entry per probe of the scene: the probe with new values, or None for no change.
+                Force-controlled tools: a control point keeps its kind of motion (moving, jumping or fixed), so one that
+                moves later needs keyframes in `at` from the start.
+                Position-controlled tools: `{"path": [[t, across, down, height], ...]}` with times after `time`. The
+                tool moves straight from its current position to the first keyframe. Instrument, friction and grips are
+                kept by default; a grip in progress continues if the new grips contain its beginning.
 
         Raises:
             ArgumentError: when the compiled kernel does not support these probes.
@@ -537,7 +537,7 @@ class Simulation:
         )
 
     def _require_no_fault(self, reading: Reading, fault: str) -> None:
-        """Raise a DivergedError if there is a fault."""
+        """Raise a DivergedError for a fault of the reading; empty if there is none."""
         if fault:
             steps, time = reading.steps, self._plan.grid.time(reading.steps)
             point = largest_displacement(reading.displacement)[:2]

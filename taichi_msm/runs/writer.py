@@ -111,7 +111,7 @@ class ResultWriter:
     def add(
         self, position: NDArray[Any], observed: Mapping[str, FrameOutputs], forces: Sequence[TipForce] = ()
     ) -> None:
-        """Add the next frame, which may be in the checkpoint already.
+        """Add the next frame. A frame of the resumed run is already in the checkpoint, and only its files are written.
 
         Args:
             position: positions of the mass points [m], shape (rows, cols, 3).
@@ -144,7 +144,7 @@ class ResultWriter:
             return self._checkpoint.save(saved)
 
     def load(self) -> Snapshot | None:
-        """Read the last saved state; None if there is none."""
+        """Read the last saved state; None without one."""
         with writing(self._directory):
             return self._checkpoint.load()
 
@@ -180,7 +180,7 @@ class ResultWriter:
         return complete_record
 
     def _write_trajectory(self) -> None:
-        """Write times [s] and positions [m] of all frames, which may exceed memory."""
+        """Write times [s] and positions [m] of all frames, in chunks, because they may exceed memory."""
         checkpoint, frames = self._checkpoint, self.frames
         shape = (frames, *self._scene.sheet.points, 3)
         arrays: dict[str, NDArray[Any] | ChunkedArray] = {
@@ -215,7 +215,7 @@ class LabelWriter:
 
     Args:
         folder: destination of the labels.
-        scene: the resolved scene.
+        scene: resolved scene, whose `output` selects the labels.
         camera: name of the camera; empty for an unnamed one.
     """
 
@@ -235,7 +235,7 @@ class LabelWriter:
         """Write the labels of a frame; tracks are kept until `finish`.
 
         Args:
-            frame: index of the frame.
+            frame: index, from 0.
             observed: labels of the camera in this frame.
             position: positions of the mass points [m], shape (rows, cols, 3).
         """
@@ -286,8 +286,8 @@ class ErrorRecord(TypedDict):
     """Error estimate of a run, relative to the largest displacement; None if unknown, for example after divergence."""
 
     error: float | None  # largest error of any mass point in any frame, due to step and rounding; None if quasi-static
-    rounding: float | None  # share of `error` due to f32; None also if the companion runs do not separate it
-    in_f64: float | None  # error of the same step in f64; None likewise
+    rounding: float | None  # share of `error` due to f32; None if not separated by the companion runs
+    in_f64: float | None  # error of the same step in f64; None as for `rounding`
     order: int | None  # of the method; None if quasi-static
     at_least: bool  # whether `error` is a lower bound
     mesh_error: NotRequired[float | None]  # discretisation error; only with tissue
@@ -301,7 +301,7 @@ class RunRecord(TypedDict, total=False):
 
     status: Literal["complete", "diverged", "interrupted"]
     error: str  # location and cause of the divergence; only if diverged
-    dump: str | None  # file with the last valid state, None if there is none; only if diverged
+    dump: str | None  # file with the last valid state, or None; only if diverged
     scene: dict[str, Any]  # as simulated, with resolved mesh, step and precision
     asked: dict[str, Any]  # requested values that differ from the resolved ones, by dotted key
     working_directory: str  # folder to which picture paths are relative

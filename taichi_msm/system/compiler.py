@@ -189,7 +189,7 @@ def compiler_label(versions: Mapping[str, str]) -> str:
 
 
 def result_versions(versions: Mapping[str, str], arch: str) -> dict[str, str]:
-    """Return the versions that determine the bits of results: all of them, except that of a tested compiler on a CPU.
+    """Return the versions that determine the bits of results: all except the version of a tested compiler on a CPU.
 
     Args:
         versions: as returned by `versions`.

@@ -97,7 +97,7 @@ class Launches:
             kernel: kernel(first, end, ended, *arguments) for indices first to end - 1; `ended` is for `end_thread`.
             total: number of indices.
             *arguments: further arguments of the kernel.
-            rounds: largest number of iterations for an index, in all loops together.
+            rounds: largest number of loop iterations per index, over all loops.
         """
         batch = total
         if self.bounded:

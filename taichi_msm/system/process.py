@@ -143,7 +143,7 @@ class Interruption:
 
 
 def exit_on_signals() -> None:
-    """Let a signal end the process at once, for use while there are no results."""
+    """End the process at once on a signal, for the time before any results exist."""
     global _stderr_copy
     _stderr_copy = os.dup(2)
     for number in SIGNALS:

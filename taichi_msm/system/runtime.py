@@ -107,7 +107,7 @@ def _recycle(arrays: list[tuple[tuple[str, int], Any]], free: dict[tuple[str, in
 _device: Device | None = None
 # Ids of the process and the thread that started Taichi.
 _start_thread = (0, 0)
-# Held while Taichi starts; two threads must not start it at once.
+# Held during the start of Taichi: two threads must not start it at once.
 _start_lock = threading.Lock()
 
 
@@ -130,7 +130,7 @@ def current_device() -> Device:
 
 
 def start(arch: str = "cpu", threads: int | None = None) -> Device:
-    """Start Taichi, unless it already runs on the same device.
+    """Start Taichi; if it already runs on the same device, only return it.
 
     Args:
         arch: cpu, cuda or vulkan.
@@ -236,7 +236,7 @@ def _cache_options() -> dict[str, Any]:
         # Taichi crashes at exit if it cannot write to the directory, even if the cache is off.
         os.environ.pop(active_compiler().folder_variable, None)
         return {"offline_cache": False, "offline_cache_file_path": private_folder()}
-    # Taichi holds the lock for milliseconds. A lock older than 60 s was left by a killed process, and blocks the cache
+    # Taichi holds the lock for milliseconds. A lock older than 60 s is of a killed process, and would block the cache
     # for all others.
     lock = folder / active_compiler().lock
     with contextlib.suppress(OSError):
@@ -275,7 +275,7 @@ def _pin(pool: list[int]) -> None:
 def _isolated_environment() -> Iterator[None]:
     """Hide environment variables that override arguments of `ti.init`, and suppress its line on stdout.
 
-    stdout itself is not redirected, because other threads may print meanwhile.
+    stdout itself is not redirected, because other threads may print to it.
     """
     prefix, namespace = f"{active_compiler().prefix}_", vars(ti.lang.misc)
     # Directories and the choice of a GPU are not arguments.
