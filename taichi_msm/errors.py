@@ -83,11 +83,11 @@ class ArgumentError(MsmError, ValueError):
 
 
 class DivergedError(MsmError):
-    """The simulation diverged.
+    """The simulation diverged. `step`, `time` and `point` are also attributes.
 
     Args:
         message: time, mass point, fault and remedy.
-        step: number of completed steps; like the following, also an attribute.
+        step: number of completed steps.
         time: simulated time [s].
         point: row and column of the mass point with the largest displacement.
     """

@@ -109,7 +109,7 @@ def check_scene(scene: Plan | Scene | Mapping[str, Any], maps: Maps | None = Non
     elif isinstance(scene, Mapping):
         plan, problems = validate(dict(scene))
     else:
-        raise ArgumentError(f"{type(scene).__name__} is not a scene; take the Scene of load_scene, or a mapping")
+        raise ArgumentError(f"{type(scene).__name__} is not a scene; take a Scene from load_scene, or a mapping")
     if plan is None or problems:
         raise SceneError([str(problem) for problem in problems])
     return plan

@@ -200,8 +200,8 @@ def drawing_bytes(scene: Scene) -> int:
     distorted = sum(isinstance(camera, Camera) and camera.distortion is not None for camera in cameras)
     sample_bytes += width * height * factor**2 * DISTORTION_BYTES * distorted
     pixel_bytes = PIXEL_BYTES + (LABEL_PIXEL_BYTES if scene.labels_pixels else 0)
-    optional = (label for name, label in LABELS.items() if label.is_optional and name in scene.output)
-    pixel_bytes += sum(LABEL_PLANE_BYTES * len(label.planes) for label in optional)
+    optional_labels = (label for name, label in LABELS.items() if label.is_optional and name in scene.output)
+    pixel_bytes += sum(LABEL_PLANE_BYTES * len(label.planes) for label in optional_labels)
     pixel_bytes += VIDEO_PIXEL_BYTES if "mp4" in scene.output else 0
     pixels = width * height * len(cameras)
     return rows * cols * POINT_BYTES + sample_bytes + pixels * pixel_bytes + image_pixels * IMAGE_PIXEL_BYTES

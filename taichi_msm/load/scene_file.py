@@ -202,7 +202,7 @@ def _build_override(key: str, value: Any) -> Override:
     try:
         plain = json.loads(json.dumps(value))
     except (TypeError, ValueError, RecursionError):
-        problem = Problem(path, f"a file cannot hold this {type(value).__name__}; use numbers, text, lists, dicts")
+        problem = Problem(path, f"{type(value).__name__} is not a type of YAML; use numbers, texts, lists or dicts")
         return Override(name, path, problems=[problem])
     return Override(f"{name}={format_value(plain)}", path, plain)
 
@@ -313,7 +313,7 @@ class Draft:
                 return Problem(key, f"{format_value(container)} is not a section; set it as a whole")
             elif not (isinstance(part, int) and part < len(container)):
                 example = ".".join(map(str, (*key, 0, *path[n:][isinstance(part, int) :])))
-                message = f"no such item; the list has {len(container)}, numbered from 0, as in {example}"
+                message = f"no such item; the list has {len(container)}, counted from 0; an example is {example}"
                 if not container:
                     message = "no such item; the list is empty, so set it as a whole"
                 return Problem((*key, part), message)
@@ -387,7 +387,7 @@ def _read_text(name: str, kind: FileKind) -> str:
         return raw.decode()
     except UnicodeDecodeError as error:
         if path.suffix.lower() in PICTURE_SUFFIXES:
-            hint = ", and the picture by --image" if kind is SCENE_KIND else ""
+            hint = " file, and pass the picture with --image" if kind is SCENE_KIND else ""
             raise SceneError([f"{name}: a picture; name a {kind.name}{hint}"]) from None
         valid = raw[: error.start].decode()
         mark = mark_at(valid, len(valid))

@@ -89,8 +89,8 @@ class Manifest:
         if original != current:
             # `original` lacks a tested compiler. If only the compiler differs, the message names it nevertheless.
             changed = any(version != current.get(name) for name, version in original.items())
-            named = original if changed else self.versions
-            differing = [f"{name} {version}" for name, version in named.items() if version != versions.get(name)]
+            listed = original if changed else self.versions
+            differing = [f"{name} {version}" for name, version in listed.items() if version != versions.get(name)]
             raise FilesError(f"the run began with {', '.join(differing)}; use these versions, or run the scene again")
 
     def has_same_bits_as(self, manifest: Manifest) -> bool:
@@ -137,8 +137,8 @@ def read_manifest(directory: Path) -> tuple[Manifest, Plan]:
     if unreadable := [str(problem) for problem in problems if problem.path[-1:] == ("image",)]:
         raise SceneError(unreadable)
     numbers = () if manifest.estimate is None else asdict(manifest.estimate).values()
-    possible = manifest.arch in ARCHS and all(number >= 0 for number in numbers)
-    if plan is None or problems or not possible or list(camera_problems(manifest.scene)):
+    is_valid = manifest.arch in ARCHS and all(number >= 0 for number in numbers)
+    if plan is None or problems or not is_valid or list(camera_problems(manifest.scene)):
         raise DamagedError(f"{path} is damaged: its scene is invalid; run the scene again")
     return manifest, plan
 
@@ -297,7 +297,7 @@ class Checkpoint:
                 self._manifest = _manifest_bytes(archive)
                 if len(archive.namelist()) == 1:
                     return None
-                arrays = {name: read_array(archive, name, each.dtype, each.shape) for name, each in expected.items()}
+                arrays = {name: read_array(archive, name, array.dtype, array.shape) for name, array in expected.items()}
         except FileNotFoundError:
             return None
         except Exception:  # zipfile raises almost any type for a forged archive

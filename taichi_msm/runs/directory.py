@@ -358,8 +358,8 @@ def _clear_abandoned(folder: Path) -> None:
         if re.fullmatch(r"\.partial-[0-9a-f]{16}", hidden.name) and entry_kind(hidden) == FOLDER:
             # Folders that are locked, incomplete, of another user or with foreign files are kept.
             with suppress(OSError, FilesError):
-                staged = r"lock|draft|picture|session|copy|animation\.(?:gif|mp4)|study\.(?:png|md|json)|sweep\.json"
-                list(list_files(hidden, [staged], strict=True))
+                pattern = r"lock|draft|picture|session|copy|animation\.(?:gif|mp4)|study\.(?:png|md|json)|sweep\.json"
+                list(list_files(hidden, [pattern], strict=True))
                 if entry_kind(hidden / LOCK_FILE) == FILE:
                     with (hidden / LOCK_FILE).open("ab", 0) as file:
                         is_abandoned = _try_lock(file)

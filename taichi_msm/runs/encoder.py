@@ -163,9 +163,9 @@ class Encoder:
     def __init__(self, job: EncodingJob, inherit: tuple[int, ...] = ()) -> None:
         # With the parent's sys.path, the child imports the same package. Unlike a child of multiprocessing, it does not
         # import the caller's main module, so that scripts need no guard.
-        code = f"import sys; sys.path[:] = {sys.path!r}; from taichi_msm.runs.encoder import main; main()"
+        script = f"import sys; sys.path[:] = {sys.path!r}; from taichi_msm.runs.encoder import main; main()"
         self._process = subprocess.Popen(
-            [sys.executable, "-c", code],
+            [sys.executable, "-c", script],
             bufsize=0,
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
@@ -197,12 +197,12 @@ class Encoder:
             self._pictures.close()
             while data := self._report_pipe.read(1 << 16):
                 self._report_data += data
-            code = self._process.wait()
+            exit_code = self._process.wait()
             result = pickle.loads(self._report_data) if self._report_data else None
             if isinstance(result, Exception):
                 raise result
             if not isinstance(result, EncodingReport):
-                raise ChildProcessError(f"the encoder ended with exit code {code}")
+                raise ChildProcessError(f"the encoder ended with exit code {exit_code}")
             self._report = result
         return self._report
 

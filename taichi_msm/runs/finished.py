@@ -173,8 +173,8 @@ class FinishedRun:
         Raises:
             FilesError: when the file is missing, or an entry on the path is of another kind.
         """
-        below = path.relative_to(self.directory)
-        for inner in [*list(below.parents)[-2::-1], below]:
+        relative = path.relative_to(self.directory)
+        for inner in [*list(relative.parents)[-2::-1], relative]:
             ancestor = self.directory / inner
             with reading(ancestor):
                 kind = entry_kind(ancestor)

@@ -202,9 +202,9 @@ class Mp4Writer:
         )
         self._stream.width, self._stream.height = (side + side % 2 for side in size)
         self._stream.pix_fmt = "yuv420p"
-        code = self._stream.codec_context
-        code.colorspace = code.color_primaries = code.color_trc = BT709
-        code.color_range = LIMITED_RANGE
+        codec = self._stream.codec_context
+        codec.colorspace = codec.color_primaries = codec.color_trc = BT709
+        codec.color_range = LIMITED_RANGE
 
     def _reopen(self, *_: object) -> BinaryIO:
         return Path(self._file.name).open("rb")

@@ -304,8 +304,8 @@ class _Run:
         # Frames without steps (the first one, redrawn ones) are a stage of their own: they distort the remaining time.
         redrawn_frames = max(self._resumed, 1)
         for frame in range(0 if scene.output else writer.frames, self._frames):
-            kind, total = ("redraw", redrawn_frames) if frame < redrawn_frames else ("frames", self._frames)
-            report = partial(self._progress, kind, frame, total)
+            stage_name, total = ("redraw", redrawn_frames) if frame < redrawn_frames else ("frames", self._frames)
+            report = partial(self._progress, stage_name, frame, total)
             report()
             with stage("simulate"):
                 simulation.advance(max(0, frame - simulation.frame), self._pause)

@@ -251,7 +251,7 @@ class Simulation:
         """
         self._require_open()
         if not isinstance(saved, Snapshot):
-            raise ArgumentError(f"{type(saved).__name__} is not a Snapshot; take one of `save`")
+            raise ArgumentError(f"{type(saved).__name__} is not a Snapshot; take one from `save`")
         state, per_frame = saved.state, self._plan.grid.steps_per_frame
         steps_in_frame = state.steps - saved.progress.frame * per_frame
         current = self._dynamics.displacement()
@@ -514,7 +514,7 @@ class Simulation:
     def _require_open(self) -> None:
         # Kernels would write to freed memory.
         if self._closed:
-            raise MsmError("this simulation is closed; make another")
+            raise MsmError("this simulation is closed; build a new one")
         runtime.require_start_thread()
 
     def _shot(self, camera: CameraLike, positions: Array | None, time: float | None) -> Shot:

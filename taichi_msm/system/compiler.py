@@ -81,7 +81,7 @@ class Compiler:
         # In a notebook the import logs a message, and an unknown log level makes the import fail. This level applies to
         # the import only; `init` sets its own.
         level = f"{self.prefix}_LOG_LEVEL"
-        before = os.environ.get(level)
+        previous = os.environ.get(level)
         os.environ[level] = "error"
         try:
             return import_module(self.name)
@@ -89,8 +89,8 @@ class Compiler:
             raise NotInstalledError(f"{self.title} cannot be imported: {error}; {self.remedy}") from error
         finally:
             del os.environ[level]
-            if before is not None:
-                os.environ[level] = before
+            if previous is not None:
+                os.environ[level] = previous
 
     @cached_property
     def patches(self) -> Patches:
@@ -168,8 +168,8 @@ def active_compiler() -> Compiler:
     """
     wanted = os.environ.get(COMPILER_VARIABLE)
     if wanted and wanted not in COMPILERS:
-        near = did_you_mean(wanted, list(COMPILERS))
-        raise DeviceError(f"{COMPILER_VARIABLE}: {wanted!r} is not a compiler; take {' or '.join(COMPILERS)}{near}")
+        hint = did_you_mean(wanted, list(COMPILERS))
+        raise DeviceError(f"{COMPILER_VARIABLE}: {wanted!r} is not a compiler; take {' or '.join(COMPILERS)}{hint}")
     candidates = [COMPILERS[wanted]] if wanted else list(COMPILERS.values())
     for compiler in candidates:
         if compiler.version:

@@ -1,8 +1,8 @@
 """Resources and signals of this process: cores, memory, interruption, standard streams.
 
-By default Python raises KeyboardInterrupt between any two bytecodes. Raised in an import, a destructor or a callback of
-a library, it is lost or becomes another error. Therefore Ctrl-C and SIGTERM only request an interruption, and the
-program raises it where it can stop.
+By default Python raises KeyboardInterrupt between any two bytecodes. Imports, destructors and callbacks of libraries
+lose it or convert it to another error. So Ctrl-C and SIGTERM only record a request, and the program raises
+KeyboardInterrupt at places where it can stop.
 """
 
 from __future__ import annotations

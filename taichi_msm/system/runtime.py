@@ -148,8 +148,8 @@ def start(arch: str = "cpu", threads: int | None = None) -> Device:
     if threads is not None and not (type(threads) is int and 1 <= threads <= MAX_THREADS):
         raise ArgumentError(f"threads: {threads!r}; take a whole number, 1 to {MAX_THREADS}, or None for every core")
     if arch not in ARCHS:
-        near = did_you_mean(str(arch), ARCHS)
-        raise DeviceError(f"--arch {arch}: not supported; take one of: {', '.join(ARCHS)}{near}")
+        hint = did_you_mean(str(arch), ARCHS)
+        raise DeviceError(f"--arch {arch}: not supported; take one of: {', '.join(ARCHS)}{hint}")
     wanted = Device(arch, process_module.available_threads() if threads is None else threads)
     with _start_lock:
         if _device is None:
@@ -181,7 +181,8 @@ def require_start_thread() -> None:
             "start processes by multiprocessing's 'spawn' or 'forkserver'"
         )
     if thread != threading.get_ident():
-        raise MsmError(f"{active_compiler().title} works in the thread that started it; simulate and draw there")
+        title = active_compiler().title
+        raise MsmError(f"{title} only works in the thread that started it; simulate and draw in that thread")
 
 
 def compilation_options(*, optimised: bool = True) -> contextlib.AbstractContextManager[None]:
@@ -294,7 +295,7 @@ def _initialise(device: Device) -> str:
     """Start Taichi; return the name of the processor or the GPU."""
     _require_address_space()
     cache = _cache_options()
-    before = _thread_ids()
+    earlier_threads = _thread_ids()
     on_cpu = device.arch == "cpu"
     try:
         # Only Taichi's log contains the name of the GPU. The log of a failed start is replaced by the error below.
@@ -315,7 +316,7 @@ def _initialise(device: Device) -> str:
         remedy = f"{active_compiler().title} reports: {' '.join(str(error).split())}" if on_cpu else "take --arch cpu"
         raise DeviceError(f"--arch {device.arch}: not available on this machine; {remedy}") from error
     # Taichi starts the threads of its pool last.
-    _pin([thread for thread in _thread_ids() if thread not in before][-device.threads :])
+    _pin([thread for thread in _thread_ids() if thread not in earlier_threads][-device.threads :])
     if on_cpu:
         return process_module.processor_name()
     return next(filter(None, gpu_name.groups())) if gpu_name else ""
