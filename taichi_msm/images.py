@@ -137,7 +137,7 @@ def _open(path: str, sha256: str | None = None) -> Iterator[Image.Image]:
             with ExitStack() as opened:
                 file = opened.enter_context(actual_path(path).open("rb"))
                 if sha256 is not None and _sha256(file) != sha256:
-                    raise PictureError(f"{path} is not the file of the run, by its SHA-256; put that one back")
+                    raise PictureError(f"{path} differs from the file of the run (SHA-256); restore the original file")
                 file.seek(0)
                 image = opened.enter_context(Image.open(file, formats=PICTURE_FORMATS))
                 if max(image.size) > MAX_SIDE_PX:

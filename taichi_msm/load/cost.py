@@ -92,7 +92,7 @@ class Budget:
 
     @property
     def disk_bytes(self) -> int:
-        """Upper bound of the size of all files."""
+        """Upper bound of the size of all results, without `working_bytes`."""
         return self.picture_bytes + self.track_bytes + self.trajectory_bytes + self.force_bytes + self.record_bytes
 
 

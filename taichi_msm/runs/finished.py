@@ -27,7 +27,7 @@ from taichi_msm.system.files import read_regular
 
 _DIGESTS, _OVERRIDES = TypeAdapter(dict[str, str]), TypeAdapter(list[str])
 
-RESTORE_PICTURE = "put back the picture that it was run with, or run the scene again"
+RESTORE_PICTURE = "restore the original picture, or run the scene again"
 
 
 @dataclass(frozen=True)
@@ -39,7 +39,7 @@ class FinishedRun:
     scene: Scene  # with resolved mesh, step and precision, and picture paths relative to the current directory
     frames: int  # number of simulated frames
     largest_frame: int  # index of the frame with the largest displacement; the last frame if unrecorded
-    sha256: Mapping[str, str]  # of the scene's picture files, by their keys in the scene
+    sha256: Mapping[str, str]  # of picture, map and camera files, by scene key
     overrides: list[str]  # of the scene file
     _record: bytes = field(repr=False)  # content of run.json
     camera: str = ""  # camera whose pictures, labels and tracks are read; empty for an unnamed camera
@@ -56,7 +56,7 @@ class FinishedRun:
             Positions of the mass points [m], shape (frames, rows, cols, 3), read-only.
 
         Raises:
-            FilesError: when the trajectory is missing, damaged or of another run.
+            FilesError: when the trajectory is missing or damaged, or does not fit the scene.
         """
         path = self.result_path("trajectory")
         dtype = np.dtype(np.float32 if self.scene.time.precision == "f32" else np.float64)
@@ -104,7 +104,7 @@ class FinishedRun:
         self._require_unchanged()
 
     def _require_unchanged(self) -> None:
-        # A publication moves run.json before any other file.
+        # A publication first moves the earlier run.json away.
         data = b""
         with suppress(OSError):
             data = read_regular(self.directory / RUN_RECORD, MAX_RECORD_BYTES)
@@ -116,7 +116,7 @@ class FinishedRun:
         for key, path in self.scene.pictures.items():
             if key == "image" and not drawn:
                 continue
-            fault = f"{path} is not the file of the run, by its SHA-256"
+            fault = f"{path} differs from the file of the run (SHA-256)"
             try:
                 if file_sha256(path) == self.sha256.get(key):
                     continue

@@ -44,15 +44,15 @@ class ResultWriter:
     """Streaming writer of the results of a run, as a context manager.
 
     Files are written to a hidden folder, and `publish` moves them into place atomically. Without `publish`, they are
-    deleted at exit. The checkpoint of a run with a manifest is kept from the first frame until complete results are
-    published. Foreign files in the directory are never changed.
+    deleted at exit. With a manifest, a checkpoint exists from the first frame to the publication of complete results.
+    Foreign files in the directory are never changed.
 
     Args:
         directory: destination of the results.
         plan: plan of the resolved scene.
         manifest: manifest of the run for its checkpoint; None for a run that cannot be resumed.
         resumes: whether to continue from the checkpoint in the directory.
-        encode_in_subprocess: whether pictures are encoded in a separate process; otherwise, `add` encodes them.
+        encode_in_subprocess: whether to encode pictures in a child process, in parallel; False: in `add`.
 
     Raises:
         FilesError: here and in all methods, when the directory cannot be written, another run writes there, or a
@@ -60,7 +60,7 @@ class ResultWriter:
 
     Attributes:
         saved: state from which the run continues; None for the initial state.
-        frames: number of frames in the results; after an interruption, only valid once `finish` has returned.
+        frames: number of frames in the results; after an interruption, valid after `finish`.
         encode_seconds: processor time of encoding pictures [s]; valid after `finish`.
     """
 
@@ -80,13 +80,13 @@ class ResultWriter:
         names = outputs.file_names(outputs.result_names(scene.folders), scene.time.frames + 1)
         with writing(directory), ExitStack() as opened:
             self._publication = opened.enter_context(Publication(directory, RUN_PUBLICATION, names))
-            staged = self._publication.new_folder
+            new_folder = self._publication.new_folder
             for name in scene.render.all_cameras if scene.renders else ():
-                (staged / name).mkdir(exist_ok=True)
-            self._labels = {name: LabelWriter(staged / name, scene, name) for name in scene.render.all_cameras}
+                (new_folder / name).mkdir(exist_ok=True)
+            self._labels = {name: LabelWriter(new_folder / name, scene, name) for name in scene.render.all_cameras}
             self._encoder: Encoder | PictureWriter | None = None
             if scene.draws:
-                folders = tuple(staged / name for name in scene.render.all_cameras)
+                folders = tuple(new_folder / name for name in scene.render.all_cameras)
                 render, rate = scene.render, scene.time.frames_per_second
                 job = EncodingJob(folders, render.size, rate, scene.output, render.background, render.quality)
                 locks = self._publication.lock_descriptors

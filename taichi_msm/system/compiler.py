@@ -35,7 +35,7 @@ class Compiler:
     prefix: str  # prefix of its environment variables
     cache: str  # directory of compiled kernels, relative to the home directory
     lock: str  # lock file of the cache, relative to that directory
-    tested_version: str  # version whose results on a CPU have the same bits as those of the other compiler
+    tested_version: str  # version with the same bits on a CPU as that of the other compiler
     python_versions: str  # versions of Python with wheels of it
     # Time to poll a counter that another thread writes [s], measured on Zen 4; Taichi fences the read by `mfence`,
     # Quadrants by a locked `or`.

@@ -193,7 +193,7 @@ def compilation_options(*, optimised: bool = True) -> contextlib.AbstractContext
     is off: it takes half the compile time, and LLVM repeats it.
 
     Args:
-        optimised: whether Taichi applies its other optimisations before LLVM; must be the same at every launch of a
+        optimised: whether Taichi applies its other optimisations before LLVM; the same value at all launches of a
             kernel.
 
     Returns:
