@@ -145,7 +145,7 @@ class Publication:
             raise ValueError("no record") from error
 
     def _require_free(self, names: Collection[str], earlier: set[str]) -> None:
-        """Require writable folders, and at the paths of new files nothing or files of earlier results."""
+        """Require writable folders, and no foreign entries at the paths of new files."""
         for folder in sorted(parent_folders(names)):
             # An unwritable folder is an error here, before the run, not later during the moves.
             path = require_kind(self._directory / folder, FOLDER)

@@ -537,7 +537,7 @@ class Simulation:
         )
 
     def _require_no_fault(self, reading: Reading, fault: str) -> None:
-        """Raise a DivergedError for a fault of the reading; empty if there is none."""
+        """Raise a DivergedError if `fault` is not empty."""
         if fault:
             steps, time = reading.steps, self._plan.grid.time(reading.steps)
             point = largest_displacement(reading.displacement)[:2]

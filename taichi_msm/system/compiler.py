@@ -115,7 +115,7 @@ class Compiler:
                 (reader, "build_stmt", read),
                 (sources, "getsourcefile", cache(sources.getsourcefile)),
                 (sources, "getsourcelines", cache(sources.getsourcelines)),
-                # Taichi wraps every line at 9999 columns, which only strips it at the end.
+                # Taichi wraps every line at 9999 columns, which only removes trailing spaces.
                 (sources, "textwrap", SimpleNamespace(fill=lambda line, **_: line.rstrip(), dedent=textwrap.dedent)),
             ]
         kernels = import_module("quadrants.lang.kernel")

@@ -186,7 +186,7 @@ def require_start_thread() -> None:
 
 
 def compilation_options(*, optimised: bool = True) -> contextlib.AbstractContextManager[None]:
-    """Return a context with the compiler's options for the kernels of this package; others keep theirs.
+    """Return a context with the compiler's options for the kernels of this package; other kernels keep theirs.
 
     Every operation is rounded by IEEE 754, so that the bits of a result do not depend on threads, lanes or compiler
     optimisation. On a CPU vectors are not split into scalars (docs/decisions/0010). Taichi's control-flow optimisation
