@@ -11,8 +11,8 @@ from taichi_msm.system import process
 
 def main() -> int:
     """Run the command line, and return its exit code."""
-    # Imports create half a million permanent objects. At the default threshold, the garbage collector takes 5 % of a
-    # short run to search them.
+    # Imports create half a million permanent objects. At the default threshold, their garbage collection takes 5 % of a
+    # short run.
     gc.set_threshold(100_000)
     # PYTHONWARNINGS=error is for a user's own code; a warning in a library must not end a command or a child process.
     if any(option and "error".startswith(option.partition(":")[0]) for option in sys.warnoptions):
@@ -31,8 +31,8 @@ def main() -> int:
     try:
         return main()
     finally:
-        # Taichi writes its kernel cache only when it is stopped. At exit the interpreter searches all objects for
-        # cycles, which takes 0.2 s unless they are frozen.
+        # Taichi writes its kernel cache only when it is stopped. Frozen objects save the interpreter a search for
+        # cycles at exit, which takes 0.2 s.
         if runtime := sys.modules.get("taichi_msm.system.runtime"):
             runtime.stop()
         gc.freeze()

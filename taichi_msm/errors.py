@@ -83,11 +83,11 @@ class ArgumentError(MsmError, ValueError):
 
 
 class DivergedError(MsmError):
-    """The simulation diverged.
+    """The simulation diverged. `step`, `time` and `point` are also attributes.
 
     Args:
         message: time, mass point, fault and remedy.
-        step: number of completed steps; like the following, also an attribute.
+        step: number of completed steps.
         time: simulated time [s].
         point: row and column of the mass point with the largest displacement.
     """
@@ -105,20 +105,20 @@ class FilesError(MsmError):
 
 
 class ForeignError(FilesError):
-    """A file or folder that no run has written is at the path of a result; it was not changed."""
+    """A foreign file or folder, not written by this program, is at the path of a result. It is unchanged."""
 
     @classmethod
     def at(cls, path: object, kind: str) -> ForeignError:
-        """Build the error for an entry in the way of a result.
+        """Build the error for a foreign entry at the path of a result.
 
         Args:
-            path: path of the entry.
+            path: foreign entry.
             kind: noun for the message, such as "a file"; see `directory.entry_kind`.
 
         Returns:
-            The error, to be raised.
+            The error, for a `raise` statement.
         """
-        return cls(f"{path}: {kind} that no run has put there; move it away or choose another folder")
+        return cls(f"{path}: {kind} not written by this program; move it away or choose another folder")
 
 
 class DamagedError(FilesError):
@@ -130,7 +130,7 @@ def printable(text: str) -> str:
     return "".join(c if c.isprintable() else c.encode("unicode_escape").decode() for c in text)
 
 
-# Limit of the length of a value in a message.
+# Largest number of characters of a value in a message.
 MAX_VALUE_LENGTH = 60
 
 
@@ -160,7 +160,7 @@ def writing(path: object, option: str = "--out") -> Iterator[None]:
 
     Args:
         path: file or folder that the block writes to, for the message.
-        option: command-line option that selects another one, for the remedy.
+        option: command-line option of the path, for the remedy.
 
     Raises:
         FilesError: in place of the OSError; contains its reason and the remedy.
@@ -175,7 +175,7 @@ def writing(path: object, option: str = "--out") -> Iterator[None]:
 
 def out_of_memory(error: Exception) -> str:
     """Return a message with the remedy for a failed allocation of memory; empty for other errors."""
-    # Taichi prefixes the line of its source.
+    # Taichi prefixes its messages with a line of its source, in brackets.
     reason = re.sub(r"^\[.*?\] ", "", " ".join(str(error).split())).rstrip(".")
     # The compilers and the encoder of pictures raise a RuntimeError.
     if isinstance(error, MemoryError) or re.search(
@@ -194,7 +194,7 @@ def as_array(values: Any, name: str) -> NDArray[Any]:
     """Convert an argument of a library call to an array.
 
     Args:
-        values: the argument, an array or nested sequences.
+        values: array or nested sequences.
         name: name of the argument, for the message.
 
     Returns:
@@ -223,7 +223,7 @@ def is_real_array(array: NDArray[Any], shape: tuple[int, ...]) -> bool:
 
 
 def require_frame_count(frames: int) -> None:
-    """Raise an ArgumentError unless a number of frames is a whole number, 0 or more."""
+    """Require a number of frames to be a whole number, 0 or more; raise an ArgumentError otherwise."""
     if isinstance(frames, bool) or not isinstance(frames, Integral) or frames < 0:
         raise ArgumentError(f"{frames!r} frames cannot be simulated; take a whole number, 0 or more")
 
@@ -232,8 +232,8 @@ def require_path(path: str | Path, name: str = "directory", remedy: str = "take 
     """Require that an argument of a library call is a path.
 
     Args:
-        path: the argument.
-        name: name of the argument, for the message.
+        path: argument of any type.
+        name: its name in the message.
         remedy: advice at the end of the message.
 
     Raises:

@@ -99,7 +99,7 @@ NOT_PROVOKED = {
     ": take a number above 0, the standard deviation in newtons",
     ": time: holds NaN or infinity; give the time of every column in seconds",
     "MB unpacked; save the sheet as CSV",
-    "a file that has other names",
+    "a hard-linked file",
     "a run of the fit ended early:",
     "another command for the same folder has ended meanwhile",
     "interrupted while the sheet was restarted; restart the scene",

@@ -39,14 +39,13 @@ def validate(data: dict[str, Any]) -> tuple[Plan | None, list[Problem]]:
     """
     problems: list[Problem] = []
     plan = None
-    # Three passes: pydantic validates the whole scene only if all sections are valid, and combinations are checked only
-    # if the whole scene is valid.
+    # At most three passes: sections; the whole scene, which pydantic validates after all sections; combinations.
     for _ in range(3):
         scene, new_problems = parse_model(Scene, data)
         problems += new_problems
         if scene is not None:
             plan, new_problems = _check_combinations(scene)
-            # The speed of a tool depends on the step, which a replaced section would change.
+            # Ignored: the speed of tools after a replacement of sections that determine the step.
             replaced = {problem.path[0] for problem in problems} & {"sheet", "tissue", "springs", "time"}
             problems += [
                 _with_file(problem, data) for problem in new_problems if not (replaced and "path" in problem.path)
@@ -57,11 +56,11 @@ def validate(data: dict[str, Any]) -> tuple[Plan | None, list[Problem]]:
 
 
 def value_at(data: Any, key: Key) -> Any:
-    """Return the value of a key of a scene that is not validated yet.
+    """Return the value at a key of unvalidated data; None for a missing key.
 
     Args:
         data: plain data, as parsed from YAML.
-        key: path to the value through mappings only; for a missing key the value is None.
+        key: path to the value, through mappings only.
     """
     for part in key:
         data = data.get(part) if isinstance(data, dict) else None
@@ -69,7 +68,7 @@ def value_at(data: Any, key: Key) -> Any:
 
 
 def _with_file(problem: Problem, data: dict[str, Any]) -> Problem:
-    """Name the trajectory file that a problem is about."""
+    """Prefix the message of a trajectory with the path of its file."""
     path = value_at(data, problem.path) if problem.path[-1:] == ("poses",) else None
     return Problem(problem.path, f"{path}: {problem.message}") if isinstance(path, str) else problem
 
@@ -77,7 +76,7 @@ def _with_file(problem: Problem, data: dict[str, Any]) -> Problem:
 def _check_combinations(
     scene: Scene, maps: Maps | None = None, *, with_image: bool = True
 ) -> tuple[Plan | None, list[Problem]]:
-    """Plan a scene, and check combinations of its keys; `with_image` also checks the image file."""
+    """Plan a scene, and check combinations of its keys; with `with_image`, also the image file."""
     plan, problems = try_plan(scene, maps)
     problems += camera_problems(scene)
     if "mp4" in scene.output and not outputs.is_pyav_installed():
@@ -93,8 +92,8 @@ def check_scene(scene: Plan | Scene | Mapping[str, Any], maps: Maps | None = Non
     """Validate a scene, and plan it for a CPU.
 
     Args:
-        scene: a scene, whose image file is not checked; a mapping of its keys; or a plan, which is returned as it is.
-        maps: images of the scene's maps, by key; they are read from their files if None.
+        scene: a `Scene`, except for its image file; a mapping with its keys; or a plan, which is returned unchanged.
+        maps: images of the scene's maps, by key; None reads them from their files.
 
     Returns:
         The plan, whose `scene` is the validated scene.
@@ -110,7 +109,7 @@ def check_scene(scene: Plan | Scene | Mapping[str, Any], maps: Maps | None = Non
     elif isinstance(scene, Mapping):
         plan, problems = validate(dict(scene))
     else:
-        raise ArgumentError(f"{type(scene).__name__} is not a scene; take the Scene of load_scene, or a mapping")
+        raise ArgumentError(f"{type(scene).__name__} is not a scene; take a Scene from load_scene, or a mapping")
     if plan is None or problems:
         raise SceneError([str(problem) for problem in problems])
     return plan

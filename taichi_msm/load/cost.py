@@ -55,19 +55,18 @@ LABEL_PIXEL_BYTES = 60  # per pixel with labels
 LABEL_PLANE_BYTES = 8  # per pixel and value of an optional label
 TRACK_BYTES = 21  # per tracked point and frame, until the run ends
 
-# Upper bounds of the overhead of a file, without a byte per row of a PNG, and of run.json without its scene [bytes].
-FILE_BYTES = 1024
-RECORD_BYTES = 1 << 16
+# Upper bounds [bytes].
+FILE_BYTES = 1024  # overhead of a file; a PNG has another byte per row
+RECORD_BYTES = 1 << 16  # run.json, without its scene
 
-# Upper bound of a row of the table of forces, and size of its values until the run ends [bytes].
-FORCE_ROW_BYTES = 180
-FORCE_BYTES = 6 * 8
+# Force of a probe in a frame [bytes].
+FORCE_ROW_BYTES = 180  # row of forces.csv, upper bound
+FORCE_BYTES = 6 * 8  # values in the checkpoint
 
-# Numbers in memory per mass point: displacement and last difference in the state; stiffness of three springs, or factor
-# of the foundation, with temporary arrays, for each map; copies at the start and for output.
-STATE_NUMBERS = 6
-MAP_NUMBERS = {"map": 6, "foundation_map": 4}
-OUTPUT_NUMBERS = 15
+# Numbers in memory per mass point.
+STATE_NUMBERS = 6  # displacement and last difference
+MAP_NUMBERS = {"map": 6, "foundation_map": 4}  # stiffness of three springs; factor of the foundation; temporary arrays
+OUTPUT_NUMBERS = 15  # copies at the start and for output
 
 
 @dataclass(frozen=True)
@@ -93,7 +92,7 @@ class Budget:
 
     @property
     def disk_bytes(self) -> int:
-        """Upper bound of the size of all files."""
+        """Upper bound of the size of all results, without `working_bytes`."""
         return self.picture_bytes + self.track_bytes + self.trajectory_bytes + self.force_bytes + self.record_bytes
 
 
@@ -127,7 +126,7 @@ def estimate_budget(plan: Plan) -> Budget:
         trajectory_bytes=position_bytes + 8 * frames + FILE_BYTES if "trajectory" in scene.output else 0,
         force_bytes=force_rows * FORCE_ROW_BYTES + FILE_BYTES if "forces" in scene.output else 0,
         record_bytes=2 * len(scene.model_dump_json(indent=2)) + RECORD_BYTES,
-        # Two checkpoints, and all positions and forces so far.
+        # Two states (the saved one and its replacement), and the positions and forces of all frames.
         working_bytes=2 * points * (STATE_NUMBERS + memory_numbers) * number_bytes
         + (position_bytes if scene.output else 0)
         + force_rows * FORCE_BYTES,
@@ -135,14 +134,14 @@ def estimate_budget(plan: Plan) -> Budget:
 
 
 def size_problems(plan: Plan) -> Iterator[Problem]:
-    """Report too many steps or too much memory of a run, each at the key to change."""
+    """Yield a problem for too many steps and one for too much memory, each at the key to change."""
     scene, grid, budget, available = plan.scene, plan.grid, estimate_budget(plan), available_memory()
     if grid.steps > MAX_STEPS:
         count = f"{scene.time.duration:g} s in steps of {grid.step:.6g} s is {grid.steps:.3g} steps"
         key, remedy = "step", "take a longer step or a shorter time"
         if scene.time.step == "auto":
             key, remedy = "duration", "take a shorter time, softer springs or more mass"
-        yield Problem(("time", key), f"{count}, more than the {MAX_STEPS:.0e} that can be taken; {remedy}")
+        yield Problem(("time", key), f"{count}, more than the limit of {MAX_STEPS:.0e}; {remedy}")
     if budget.memory_bytes <= available:
         return
     rows, cols = scene.sheet.points
@@ -155,7 +154,7 @@ def size_problems(plan: Plan) -> Iterator[Problem]:
     yield Problem(
         (section, key),
         f"the scene needs {_format_bytes(budget.memory_bytes)} of memory, {_format_bytes(size)} of it for {name}, "
-        f"but {_format_bytes(available)} is free; reduce it",
+        f"but {_format_bytes(available)} is free; reduce {section}.{key}",
     )
 
 
@@ -163,8 +162,8 @@ def require_disk(plan: Plan, directory: Path) -> None:
     """Require that a disk has enough free space for a run.
 
     Args:
-        plan: plan of the run.
-        directory: destination of the results, which need not exist.
+        plan: plan of the run; determines the files.
+        directory: destination of the results; may be missing.
 
     Raises:
         SceneError: when an upper bound of the files exceeds the free space; names the key with the largest share.
@@ -182,14 +181,14 @@ def require_disk(plan: Plan, directory: Path) -> None:
     )
     message = (
         f"{budget.frames} frames may need {_format_bytes(needed)} on disk, {_format_bytes(size)} of it for {name}, but "
-        f"{_format_bytes(free)} is free for {directory}; reduce it, time.frames_per_second or output, or choose "
-        "another --out"
+        f"{_format_bytes(free)} is free for {directory}; reduce {key}, time.frames_per_second or output, or "
+        "choose another --out"
     )
     raise SceneError([f"{key}: {message}"])
 
 
 def drawing_bytes(scene: Scene) -> int:
-    """Estimate the memory for drawing a frame [bytes], even if the scene has no such output."""
+    """Estimate the memory for drawing a frame [bytes], also for scenes without pictures in their output."""
     rows, cols = scene.sheet.points
     width, height = scene.render.size
     # The whole image is decoded, even if only a region of it is used.
@@ -201,8 +200,8 @@ def drawing_bytes(scene: Scene) -> int:
     distorted = sum(isinstance(camera, Camera) and camera.distortion is not None for camera in cameras)
     sample_bytes += width * height * factor**2 * DISTORTION_BYTES * distorted
     pixel_bytes = PIXEL_BYTES + (LABEL_PIXEL_BYTES if scene.labels_pixels else 0)
-    optional = (label for name, label in LABELS.items() if label.is_optional and name in scene.output)
-    pixel_bytes += sum(LABEL_PLANE_BYTES * len(label.planes) for label in optional)
+    optional_labels = (label for name, label in LABELS.items() if label.is_optional and name in scene.output)
+    pixel_bytes += sum(LABEL_PLANE_BYTES * len(label.planes) for label in optional_labels)
     pixel_bytes += VIDEO_PIXEL_BYTES if "mp4" in scene.output else 0
     pixels = width * height * len(cameras)
     return rows * cols * POINT_BYTES + sample_bytes + pixels * pixel_bytes + image_pixels * IMAGE_PIXEL_BYTES
@@ -231,7 +230,7 @@ class DurationEstimate(NamedTuple):
     """Estimated duration of a run [s]."""
 
     seconds: float
-    start: float  # part of it before the first step
+    start: float  # share before the first step [s], included in `seconds`
 
 
 def estimate_duration(plan: Plan) -> DurationEstimate:
@@ -243,7 +242,7 @@ def estimate_duration(plan: Plan) -> DurationEstimate:
 
 @cache
 def _calibrate() -> float:
-    """Time a step of a small sheet in NumPy [s]; the minimum of 20 runs is least disturbed by other programs."""
+    """Measure the time of a step of a small sheet in NumPy [s]: the minimum of 20, least disturbed by others."""
     field, fastest = np.zeros((256, 256), np.float32), math.inf
     for _ in range(20):
         start = time.perf_counter()

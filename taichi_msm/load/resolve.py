@@ -1,4 +1,4 @@
-"""Choice of the settings that a scene leaves open: mass points, time step and precision.
+"""Choice of the open settings of a scene: mass points, time step and precision.
 
 Unlike validation (check.py), this starts the compiler.
 """
@@ -26,7 +26,7 @@ class ResolvedPlan(NamedTuple):
 
 
 def resolve(plan: Plan, device: Device, progress: ProgressCallback = lambda done, total: None) -> ResolvedPlan:
-    """Choose the settings that a scene leaves open, by trial runs if it has tolerances.
+    """Choose the open settings of a scene; for a scene with tolerances, by trial runs.
 
     Args:
         plan: plan of a valid scene, checked for a CPU.
@@ -41,7 +41,7 @@ def resolve(plan: Plan, device: Device, progress: ProgressCallback = lambda done
     """
     estimate = mesh = None
     plan = planning.choose_precision(plan, device.arch)
-    # On a CPU, `auto` may have chosen another precision.
+    # The plan was checked for a CPU, where `auto` may choose another precision.
     if problems := [str(problem) for problem in planning.precision_problems(plan)]:
         raise SceneError(problems)
     if plan.scene.sheet.tolerance is not None:

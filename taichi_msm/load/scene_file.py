@@ -20,7 +20,7 @@ from taichi_msm.model.plan import Plan
 from taichi_msm.scene.scene import Scene
 from taichi_msm.scene.section import MAX_PATH, format_value
 
-# Limit of the size of a file.
+# Largest size of a file [bytes].
 MAX_BYTES = 2**20
 
 # Keys whose values are paths of pictures.
@@ -65,9 +65,9 @@ def load_scene(
     Args:
         path: path of the scene file. Paths in the file are relative to its folder, and must be in this folder or below
             it. Paths in overrides are also relative to this folder, but may be outside it.
-        overrides: values that replace those of the file: texts "KEY=VALUE" with a dotted key, with indices for items
-            of lists (probes.0.load), and a value in YAML, called --set in messages; or a mapping from dotted keys to
-            values, called override in messages.
+        overrides: replacements of values of the file, by dotted keys with indices for items of lists (probes.0.load):
+            texts "KEY=VALUE" with the value in YAML (--set in messages), or a mapping from keys to values (override in
+            messages).
         image: path of another image for the sheet, relative to the current directory.
 
     Returns:
@@ -104,7 +104,7 @@ def load_plan(
         SceneError: as for `load_scene`.
     """
     if isinstance(path, Mapping):
-        raise ArgumentError("path: a mapping; Scene(**mapping) is its scene, and load_scene reads a file")
+        raise ArgumentError("path: a mapping; take the path of a scene file, or build Scene(**mapping)")
     return plan_file(read_file(str(path), SCENE_KIND), overrides, image)
 
 
@@ -114,7 +114,7 @@ def plan_file(
     """Validate a parsed scene file, and plan the scene for a CPU.
 
     Args:
-        file: the parsed file.
+        file: scene file from `read_file`.
         overrides: as for `load_scene`.
         image: as for `load_scene`.
 
@@ -133,7 +133,9 @@ def plan_file(
     if "scene" in draft.data and {"vary", "variables"} & draft.data.keys():
         raise SceneError([f"{file.name}:1:1: a sweep; use `taichi-msm sweep`"])
     parsed = (
-        starmap(_parse_value, overrides.items()) if isinstance(overrides, Mapping) else map(parse_override, overrides)
+        starmap(_build_override, overrides.items())
+        if isinstance(overrides, Mapping)
+        else map(parse_override, overrides)
     )
     for override in parsed:
         draft.override(override)
@@ -149,13 +151,13 @@ def plan_file(
 
 
 def names_file(key: Key) -> bool:
-    """Return whether the value of a key, if it is a text, is the path of a file."""
+    """Return whether a text at a key is the path of a file."""
     is_camera = key[:-1] == ("render", "camera") or (key[:2] == ("render", "cameras") and len(key) == 4)
     return key in PICTURE_KEYS or (is_camera and key[-1] in CAMERA_FILE_KEYS)
 
 
 def camera_files(data: Mapping[str, Any]) -> list[tuple[Key, str]]:
-    """List the keys of cameras whose values are paths of files, with these paths."""
+    """List the keys and paths of camera files."""
     cameras = value_at(data, ("render", "cameras"))
     sections: list[Key] = [("render", "camera")]
     sections += [("render", "cameras", name) for name in (cameras if isinstance(cameras, dict) else ())]
@@ -169,7 +171,7 @@ def schema() -> dict[str, Any]:
 
 
 class Override(NamedTuple):
-    """A value that replaces one of the file."""
+    """Replacement of a value of the file."""
 
     name: str  # as in messages
     path: Key
@@ -192,7 +194,7 @@ def parse_override(text: str) -> Override:
     return Override(name, path, document.data, faults)
 
 
-def _parse_value(key: str, value: Any) -> Override:
+def _build_override(key: str, value: Any) -> Override:
     path = parse_key(key)
     name = f"override {truncate(key)}"
     if not path:
@@ -200,7 +202,7 @@ def _parse_value(key: str, value: Any) -> Override:
     try:
         plain = json.loads(json.dumps(value))
     except (TypeError, ValueError, RecursionError):
-        problem = Problem(path, f"a file cannot hold this {type(value).__name__}; use numbers, text, lists, dicts")
+        problem = Problem(path, f"{type(value).__name__} is not a type of YAML; use numbers, texts, lists or dicts")
         return Override(name, path, problems=[problem])
     return Override(f"{name}={format_value(plain)}", path, plain)
 
@@ -222,7 +224,7 @@ class _Origin(NamedTuple):
 
 
 class Draft:
-    """Content of a parsed file with overrides, before validation, and problems, each with its origin."""
+    """Unvalidated content of a parsed file, with overrides applied, and its problems with their origins."""
 
     def __init__(self, file: ParsedFile) -> None:
         document = file.document
@@ -238,18 +240,17 @@ class Draft:
         origin = _Origin(self._overrides, Mark(1, 1), override.name)
         if override.problems:
             self.problems += [(origin, problem) for problem in override.problems]
-        elif problem := self._put(override.path, override.value, origin):
+        elif problem := self._set_value(override.path, override.value, origin):
             self.problems.append((origin, problem))
 
     def resolve_path(self, key: Key, folder: Path) -> None:
-        """Convert the path of a file from relative to a folder to relative to the current directory.
+        """Make a path of the file relative to the current directory.
 
-        A path that is neither below the folder nor in an override is recorded as a problem, and so is a missing file of
-        a camera.
+        Recorded as problems: a path outside the folder, except from an override, and a missing camera file.
 
         Args:
-            key: key whose value is the path; other values are left to validation.
-            folder: folder of the scene file.
+            key: key of the path; values other than a text are ignored, for validation.
+            folder: folder of the scene file, to which the path is relative.
         """
         section, path = value_at(self.data, key[:-1]), value_at(self.data, key)
         if not (isinstance(path, str) and 0 < len(path) <= MAX_PATH):
@@ -264,7 +265,7 @@ class Draft:
             self.problems.append((self._origin(key), Problem(key, message)))
             del section[key[-1]]
         elif key not in PICTURE_KEYS:
-            # Validation stops at the first file of the cameras that is missing.
+            # Validation would report only the first missing camera file.
             try:
                 actual_path(str(folder / path)).stat()
             except OSError as error:
@@ -301,7 +302,7 @@ class Draft:
         in_file = (self._in_file(self._marks[key]) for key in containers if key in self._marks)
         return next(chain(overridden, in_file))
 
-    def _put(self, path: Key, value: Any, origin: _Origin) -> Problem | None:
+    def _set_value(self, path: Key, value: Any, origin: _Origin) -> Problem | None:
         """Set a key, and create missing sections above it."""
         container: Any = self.data
         key: Key = ()
@@ -309,10 +310,10 @@ class Draft:
             if isinstance(container, dict):
                 part = str(part)
             elif not isinstance(container, list):
-                return Problem(key, f"{format_value(container)} has no keys to set one of; set it as a whole")
+                return Problem(key, f"{format_value(container)} is not a section; set it as a whole")
             elif not (isinstance(part, int) and part < len(container)):
                 example = ".".join(map(str, (*key, 0, *path[n:][isinstance(part, int) :])))
-                message = f"no such item; the list has {len(container)}, numbered from 0, as in {example}"
+                message = f"no such item; the list has {len(container)}, counted from 0; an example is {example}"
                 if not container:
                     message = "no such item; the list is empty, so set it as a whole"
                 return Problem((*key, part), message)
@@ -329,16 +330,16 @@ class Draft:
 
 
 def is_below(path: Path, folder: Path) -> bool:
-    """Return whether a path is a folder or below it, with symbolic links resolved.
+    """Return whether a path, with symbolic links resolved, is inside a folder or the folder itself.
 
     Args:
-        path: any path, which need not exist.
-        folder: the folder; both paths are relative to the current directory.
+        path: path relative to the current directory, possibly missing.
+        folder: path relative to the current directory.
     """
     try:
         return path.resolve().is_relative_to(folder.resolve())
     except (OSError, RuntimeError, ValueError):
-        # For a loop of links or an invalid path, reading the file raises an error.
+        # A loop of links or an invalid path: reading the file later raises the error.
         return True
 
 
@@ -346,7 +347,7 @@ def read_file(name: str, kind: FileKind) -> ParsedFile:
     """Read and parse a YAML file of an expected kind.
 
     Args:
-        name: path of the file, as in messages.
+        name: path of the file, relative to the current directory; also the name in messages.
         kind: name and required keys of such a file, for messages.
 
     Returns:
@@ -386,7 +387,7 @@ def _read_text(name: str, kind: FileKind) -> str:
         return raw.decode()
     except UnicodeDecodeError as error:
         if path.suffix.lower() in PICTURE_SUFFIXES:
-            hint = ", and the picture by --image" if kind is SCENE_KIND else ""
+            hint = " file, and pass the picture with --image" if kind is SCENE_KIND else ""
             raise SceneError([f"{name}: a picture; name a {kind.name}{hint}"]) from None
         valid = raw[: error.start].decode()
         mark = mark_at(valid, len(valid))

@@ -1,8 +1,8 @@
 """Parser of a safe subset of YAML 1.2, which records the line and column of each key.
 
-The data is built directly from the events of PyYAML. Anchors, aliases, tags, further documents and deep nesting, which
-no scene needs, are rejected as their events arrive. So a text cannot cause unlimited recursion or expansion of aliases,
-or load anything. Scalars follow the core schema of YAML 1.2: 1e4 is a number, 010 is ten, `yes` is a text.
+The data is built directly from the events of PyYAML. Anchors, aliases, tags, further documents and deep nesting are
+rejected as their events arrive; no scene needs them. So no text causes unlimited recursion, expands aliases or loads
+objects. Scalars follow the core schema of YAML 1.2: 1e4 is a number, 010 is ten, `yes` is a text.
 """
 
 from __future__ import annotations
@@ -72,9 +72,9 @@ def read_yaml(text: str) -> Document:
     if match := _NOT_ALLOWED.search(text):
         message = f"character U+{ord(match[0]):04X} is not allowed; remove it"
         raise UnreadableError(mark_at(text, match.start()), message)
-    reader = _DocumentBuilder(yaml.parse(text, Loader=yaml.CSafeLoader))
+    builder = _DocumentBuilder(yaml.parse(text, Loader=yaml.CSafeLoader))
     try:
-        return Document(reader.document(), reader.marks, reader.faults)
+        return Document(builder.document(), builder.marks, builder.faults)
     except yaml.MarkedYAMLError as error:
         raise _syntax_error(text, error) from None
     except yaml.YAMLError as error:
@@ -94,7 +94,7 @@ def mark_at(text: str, index: int) -> Mark:
 
 def _syntax_error(text: str, error: yaml.MarkedYAMLError) -> UnreadableError:
     if error.problem == "could not find expected ':'" and error.context_mark:
-        # The parser reports the next line, or the end of the text.
+        # libyaml reports the line after the fault, or the end of the text.
         line = text[error.context_mark.index :].partition("\n")[0]
         return UnreadableError(_mark(error.context_mark), f'no ":" in "{truncate(line.strip())}"; expected KEY: VALUE')
     mark = error.problem_mark or error.context_mark
@@ -117,7 +117,7 @@ def _plain_value(text: str) -> Any:
     """Convert a plain scalar."""
     if text in _WORDS:
         return _WORDS[text]
-    # Longer ones are texts, because Python cannot convert integers of several thousand digits.
+    # Longer scalars stay texts, because Python does not convert integers of several thousand digits.
     if text[0] in "+-.0123456789" and len(text) <= 100:
         for pattern, convert in _NUMBERS:
             if pattern.fullmatch(text):

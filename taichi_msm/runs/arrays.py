@@ -40,16 +40,20 @@ def write_arrays(file: BinaryIO, arrays: Mapping[str, NDArray[Any] | ChunkedArra
     """
     with zipfile.ZipFile(file, "w", zipfile.ZIP_STORED) as archive:
         for name, array in arrays.items():
-            chunked = array if isinstance(array, ChunkedArray) else ChunkedArray(array.dtype, array.shape, _rows(array))
+            chunked = (
+                array
+                if isinstance(array, ChunkedArray)
+                else ChunkedArray(array.dtype, array.shape, _contiguous_chunks(array))
+            )
             # The date is fixed, at the earliest of the zip format, so that equal arrays produce identical files.
             info = zipfile.ZipInfo(f"{name}.npy", (1980, 1, 1, 0, 0, 0))
             with archive.open(info, "w", force_zip64=True) as entry:
-                entry.write(_header(chunked.dtype, chunked.shape))
+                entry.write(_npy_header(chunked.dtype, chunked.shape))
                 for chunk in chunked.chunks:
                     entry.write(chunk.data)
 
 
-def _rows(array: NDArray[Any]) -> Iterable[NDArray[Any]]:
+def _contiguous_chunks(array: NDArray[Any]) -> Iterable[NDArray[Any]]:
     """Split an array into contiguous chunks, without a copy of all of it."""
     return [array] if array.flags.c_contiguous else (np.ascontiguousarray(row) for row in array)
 
@@ -60,8 +64,8 @@ def read_array(archive: zipfile.ZipFile, name: str, dtype: DTypeLike, shape: Sha
     Args:
         archive: open .npz archive.
         name: name of the array, without ".npy".
-        dtype: expected dtype.
-        shape: expected shape.
+        dtype: expected dtype, with byte order.
+        shape: expected shape, in C order.
 
     Returns:
         The array, read-only.
@@ -70,7 +74,7 @@ def read_array(archive: zipfile.ZipFile, name: str, dtype: DTypeLike, shape: Sha
         ValueError: when dtype or shape differ; raised before memory is allocated.
         Exception: when the archive is damaged; `zipfile` raises many types.
     """
-    header, info = _header(dtype, shape), _entry(archive, name, dtype, shape)
+    header, info = _npy_header(dtype, shape), _find_entry(archive, name, dtype, shape)
     data = archive.read(info)
     if data[: len(header)] != header:
         raise ValueError(name)
@@ -89,7 +93,7 @@ def read_rows(archive: zipfile.ZipFile, name: str, dtype: DTypeLike, row_shape: 
     Returns:
         The array, shape (rows, *row_shape), read-only.
     """
-    header_bytes, row_bytes = len(_header(dtype, (0, *row_shape))), math.prod(row_shape) * np.dtype(dtype).itemsize
+    header_bytes, row_bytes = len(_npy_header(dtype, (0, *row_shape))), math.prod(row_shape) * np.dtype(dtype).itemsize
     rows = (archive.getinfo(f"{name}.npy").file_size - header_bytes) // row_bytes
     return read_array(archive, name, dtype, (max(0, rows), *row_shape))
 
@@ -109,9 +113,9 @@ def map_array(path: Path, name: str, dtype: DTypeLike, shape: Shape) -> NDArray[
     Raises:
         ValueError: as for `read_array`, or when the CRC-32 differs.
     """
-    header = _header(dtype, shape)
+    header = _npy_header(dtype, shape)
     with path.open("rb") as file, zipfile.ZipFile(file) as archive:
-        info = _entry(archive, name, dtype, shape)
+        info = _find_entry(archive, name, dtype, shape)
         # The data follow the local header, the name and the extra field, whose lengths are bytes 26 to 29.
         file.seek(info.header_offset + 26)
         file.seek(sum(struct.unpack("<HH", file.read(4))), 1)
@@ -123,17 +127,17 @@ def map_array(path: Path, name: str, dtype: DTypeLike, shape: Shape) -> NDArray[
     return mapped
 
 
-def _entry(archive: zipfile.ZipFile, name: str, dtype: DTypeLike, shape: Shape) -> zipfile.ZipInfo:
-    """Find the entry of an array; raise a ValueError unless it is uncompressed and of the expected size."""
+def _find_entry(archive: zipfile.ZipFile, name: str, dtype: DTypeLike, shape: Shape) -> zipfile.ZipInfo:
+    """Find the entry of an array; raise a ValueError if it is compressed or not of the expected size."""
     info = archive.getinfo(f"{name}.npy")
-    size = len(_header(dtype, shape)) + math.prod(shape) * np.dtype(dtype).itemsize
-    # Compressed data could expand to any size, whatever the header states.
+    size = len(_npy_header(dtype, shape)) + math.prod(shape) * np.dtype(dtype).itemsize
+    # Compressed data could expand beyond the size in the header.
     if info.compress_type != zipfile.ZIP_STORED or (info.file_size, info.compress_size) != (size, size):
         raise ValueError(name)
     return info
 
 
-def _header(dtype: DTypeLike, shape: Shape) -> bytes:
+def _npy_header(dtype: DTypeLike, shape: Shape) -> bytes:
     header = io.BytesIO()
     descr = npy.dtype_to_descr(np.dtype(dtype))
     npy.write_array_header_1_0(header, {"descr": descr, "fortran_order": False, "shape": shape})
@@ -156,7 +160,7 @@ def read_flo(path: Path, size: tuple[int, int]) -> NDArray[np.float32]:
     """Read optical flow from a .flo file.
 
     Args:
-        path: the file.
+        path: .flo file, possibly untrusted.
         size: expected width and height [px].
 
     Returns:
@@ -168,9 +172,9 @@ def read_flo(path: Path, size: tuple[int, int]) -> NDArray[np.float32]:
     width, height = size
     header, length = _flo_header(width, height), 8 * width * height
     with path.open("rb") as file:
-        # Reading the expected size only bounds the memory, whatever the file contains.
-        start, data, rest = file.read(len(header)), file.read(length), file.read(1)
-    if start != header or len(data) != length or rest:
+        # At most one byte beyond the expected size is read, so a forged file cannot exhaust the memory.
+        start, data, excess = file.read(len(header)), file.read(length), file.read(1)
+    if start != header or len(data) != length or excess:
         raise ValueError(f"not a flow of {width} x {height} pixels")
     return np.frombuffer(data, "<f4").reshape(height, width, 2)
 

@@ -1,8 +1,11 @@
 """Checkpoint of an unfinished run, from which another process can continue it.
 
-A checkpoint is a folder with two files: `state.npz` has the manifest of the run, which contains all inputs on which its
-results depend, and the last saved state of the solver; `frames` has positions and forces of every frame. The CRC-32 of
-each part is verified before the part is used. Contents are also validated, because the folder may be untrusted.
+A checkpoint is a folder with two files:
+
+- `state.npz`: the manifest, with all inputs that determine the results, and the last saved state of the solver;
+- `frames`: positions and forces of every frame.
+
+Readers verify the CRC-32 of each part, and validate its contents, because the folder may be untrusted.
 """
 
 from __future__ import annotations
@@ -46,23 +49,23 @@ CHECKPOINT_PATTERNS = (
     r"(?:manifest\.json|positions|forces)",  # of earlier versions
 )
 
-# Numbers of a `TipForce`, tip and force, and of a `PeakForce`, time and force.
+# Columns of a `TipForce` (tip, force) and of a `PeakForce` (time, force).
 FORCE_COLUMNS, PEAK_FORCE_COLUMNS = 6, 4
 
 
 @dataclass(frozen=True)
 class Manifest:
-    """Inputs of a run, from which another process continues it to the same bits."""
+    """All inputs that determine the bits of the results of a run."""
 
     given: Scene  # as loaded
     scene: Scene  # with resolved mesh, step and precision
     overrides: tuple[str, ...]  # of the scene file
-    estimate: TimeStepEstimate | None  # time-step error, if `time.tolerance` required it before the run
-    mesh: MeshEstimate | None  # mesh error, if `sheet.tolerance` required it before the run
-    asks_estimate: bool | None  # whether to estimate the error during the run; None if it is cheap
-    folder: str  # the current directory, to which picture paths are relative
+    estimate: TimeStepEstimate | None  # time-step error by trial runs; None without `time.tolerance`
+    mesh: MeshEstimate | None  # mesh error by trial runs; None without `sheet.tolerance`
+    asks_estimate: bool | None  # whether to estimate the error during the run; None: only if cheap
+    folder: str  # directory to which picture paths are relative; the current one of `run`
     arch: str  # cpu, cuda or vulkan
-    sha256: Mapping[str, str]  # of the files of picture, maps and cameras, by their keys in the scene
+    sha256: Mapping[str, str]  # of picture, map and camera files, by scene key
     versions: Mapping[str, str]  # of all software that affects the results
 
     def as_json(self) -> dict[str, Any]:
@@ -84,14 +87,14 @@ class Manifest:
                 raise FilesError(f"{path} has changed since the run began; put it back, or run the scene again")
         original, current = result_versions(self.versions, self.arch), result_versions(versions, self.arch)
         if original != current:
-            # If the run began with a tested compiler, and the current one is untested, only the latter is compared.
+            # `original` lacks a tested compiler. If only the compiler differs, the message names it nevertheless.
             changed = any(version != current.get(name) for name, version in original.items())
-            named = original if changed else self.versions
-            differing = [f"{name} {version}" for name, version in named.items() if version != versions.get(name)]
+            listed = original if changed else self.versions
+            differing = [f"{name} {version}" for name, version in listed.items() if version != versions.get(name)]
             raise FilesError(f"the run began with {', '.join(differing)}; use these versions, or run the scene again")
 
     def has_same_bits_as(self, manifest: Manifest) -> bool:
-        """Return whether both runs produce results with the same bits, so that either can continue the other."""
+        """Return whether another manifest yields the same bits, so that either run can continue the other."""
         return self._result_inputs() == manifest._result_inputs()
 
     def _result_inputs(self) -> tuple[Any, ...]:
@@ -123,7 +126,7 @@ def read_manifest(directory: Path) -> tuple[Manifest, Plan]:
     try:
         with file, zipfile.ZipFile(file) as archive:
             manifest = _MANIFEST_ADAPTER.validate_python(json.loads(_manifest_bytes(archive)))
-        # The current directory may be another one.
+        # The current directory may differ from that of the original process.
         manifest = replace(manifest, scene=manifest.scene.with_pictures(partial(os.path.join, manifest.folder)))
     except Exception:  # zipfile raises almost any type for a forged archive
         if path.with_name("manifest.json").exists():
@@ -134,9 +137,9 @@ def read_manifest(directory: Path) -> tuple[Manifest, Plan]:
     if unreadable := [str(problem) for problem in problems if problem.path[-1:] == ("image",)]:
         raise SceneError(unreadable)
     numbers = () if manifest.estimate is None else asdict(manifest.estimate).values()
-    possible = manifest.arch in ARCHS and all(number >= 0 for number in numbers)
-    if plan is None or problems or not possible or list(camera_problems(manifest.scene)):
-        raise DamagedError(f"{path} is of a scene that cannot be run; run the scene again")
+    is_valid = manifest.arch in ARCHS and all(number >= 0 for number in numbers)
+    if plan is None or problems or not is_valid or list(camera_problems(manifest.scene)):
+        raise DamagedError(f"{path} is damaged: its scene is invalid; run the scene again")
     return manifest, plan
 
 
@@ -150,9 +153,9 @@ def is_unfinished(directory: Path) -> bool:
 
 
 def input_digests(plan: Plan) -> dict[str, str]:
-    """Compute the SHA-256 of the files of picture, maps and cameras, by their keys in the scene.
+    """Compute the SHA-256 of picture, map and camera files, by scene key.
 
-    An unreadable picture is omitted. Digests of maps and cameras are those of the files as read for the plan.
+    An unreadable picture is omitted. Digests of maps and cameras come from the plan, which read the files.
     """
     scene = plan.scene
     sha256 = {**plan.sha256} | {f"{scene.kind}.{name}.image": image.sha256 for name, image in plan.maps.items()}
@@ -183,8 +186,8 @@ class Checkpoint:
     """Checkpoint folder of a run. It stays valid whenever the process is killed.
 
     Args:
-        folder: the folder; `begin` creates it.
-        plan: the plan of the run.
+        folder: path inside the staging folder; `begin` creates it.
+        plan: plan of the run; determines shapes and dtypes of the parts.
 
     Raises:
         DamagedError: from the methods that read, when a part is damaged; the message names the part.
@@ -200,7 +203,7 @@ class Checkpoint:
         self.precision = np.dtype(np.float32 if plan.grid.precision == "f32" else np.float64)
         self._plan, self._state_path, self._frames_path = plan, folder / STATE_FILE, folder / FRAMES_FILE
         self._next_save, self._manifest = 0.0, b""
-        self._file: BinaryIO | None = None  # without outputs, the frames are not needed
+        self._file: BinaryIO | None = None  # None without outputs: the frames are not needed
         self._stored_probes = len(scene.probes) if scene.asks_for("forces") else 0
         position = "position", self.precision, (*scene.sheet.points, 3)
         forces = "forces", np.float64, (self._stored_probes, FORCE_COLUMNS)
@@ -230,7 +233,7 @@ class Checkpoint:
         self._state_path.unlink(missing_ok=True)
 
     def reopen(self) -> Snapshot | None:
-        """Open the checkpoint of an earlier run; return its last saved state, None to continue from the first frame."""
+        """Open the checkpoint of an earlier run; return its last saved state, or None for the initial state."""
         self.close()
         saved = self.load()
         self.frames = 0 if saved is None else saved.progress.frame + 1
@@ -241,7 +244,7 @@ class Checkpoint:
                 raise _damaged(self._frames_path) from None
             status = os.fstat(self._file.fileno())
             if status.st_nlink > 1:
-                raise ForeignError.at(self._frames_path, "a file that has other names")
+                raise ForeignError.at(self._frames_path, "a hard-linked file")
             if status.st_size < self.frames * self._record.itemsize:
                 raise _damaged(self._frames_path)
         return saved
@@ -294,7 +297,7 @@ class Checkpoint:
                 self._manifest = _manifest_bytes(archive)
                 if len(archive.namelist()) == 1:
                     return None
-                arrays = {name: read_array(archive, name, each.dtype, each.shape) for name, each in expected.items()}
+                arrays = {name: read_array(archive, name, array.dtype, array.shape) for name, array in expected.items()}
         except FileNotFoundError:
             return None
         except Exception:  # zipfile raises almost any type for a forged archive
@@ -324,7 +327,7 @@ class Checkpoint:
         draft.replace(self._state_path)
 
     def _read(self, frame: int) -> tuple[NDArray[Any], NDArray[np.float64]]:
-        """Read positions and forces of a frame; raise a DamagedError unless they are finite and their checksum fits."""
+        """Read positions and forces of a frame; raise a DamagedError for non-finite values or a wrong checksum."""
         assert self._file
         self._file.seek(frame * self._record.itemsize)
         records = np.fromfile(self._file, self._record, 1)
@@ -336,7 +339,7 @@ class Checkpoint:
         raise _damaged(self._frames_path)
 
     def _checksum(self, frame: int, *parts: NDArray[Any]) -> int:
-        """Compute the CRC-32 of a frame, its index and the manifest, so that parts of different runs do not mix."""
+        """Compute the CRC-32 of a frame, its index and the manifest, which detects frames of another run or index."""
         checksum = zlib.crc32(frame.to_bytes(8, "little"), zlib.crc32(self._manifest))
         for part in parts:
             checksum = zlib.crc32(part.data, checksum)

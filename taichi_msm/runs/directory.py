@@ -1,14 +1,18 @@
 """Atomic replacement of files and of all results in a directory.
 
-New results are written to `.partial/new` inside the directory. The publication is committed when this folder, complete,
-is renamed to `.partial/whole`. Then the record of the earlier results is moved aside, the new files are moved into
-place, obsolete files are deleted, and the new record is moved last. A directory with a record therefore always contains
-complete and consistent results. If the process is killed before the commit, the directory is unchanged; after it, the
-next publication completes the moves.
+A publication has three steps:
 
-The record lists the files of a publication, and only listed files are replaced or deleted. Any other entry in the way,
-such as a link or a device, is an error, raised before anything is changed. A folder is checked when work in it begins;
-later, files are created exclusively. Processes that can write to the directory during a run are trusted.
+1. Write the new results to `.partial/new` inside the directory.
+2. Commit: rename this folder to `.partial/whole`.
+3. Move the record of the earlier results aside, and the new files into place. Delete obsolete files. Move the new
+   record into place, last.
+
+So a directory with a record contains complete and consistent results. A process killed before the commit leaves the
+directory unchanged; after the commit, the next publication completes step 3.
+
+The record lists the files of a publication, and only listed files are replaced or deleted. A foreign entry at the path
+of a result, such as a link or a device, is an error before any change. Folders are checked when a publication begins;
+from then on, files are created exclusively. Processes with write access to the directory during a run are trusted.
 
 Single files are replaced atomically, too: they are written to a hidden folder next to their destination and renamed.
 """
@@ -46,12 +50,12 @@ class PublicationSpec(NamedTuple):
     record: str  # name of the file that lists the others
     patterns: Collection[str]  # of all files that may be published, including the record
     read_record: Callable[[Mapping[str, Any]], IsListed]  # converts a record to a predicate of file names
-    exclusive: bool = False  # whether the directory may not contain other files
-    companion: tuple[str, Collection[str]] | None = None  # a folder that stays unpublished, and its patterns
+    exclusive: bool = False  # whether other files in the directory are errors
+    companion: tuple[str, Collection[str]] | None = None  # an unpublished folder, and patterns of its files
 
 
 class Publication:
-    """Publication of new files in a directory, as a context manager. Without `publish`, they are discarded at exit.
+    """Publication of new files in a directory: a context manager that discards them at exit, except after `publish`.
 
     Args:
         directory: destination; created if missing.
@@ -116,7 +120,7 @@ class Publication:
         return self
 
     def __exit__(self, *_: object) -> None:
-        # The next publication repeats a cleanup that fails; an exception in flight takes precedence.
+        # Errors are ignored: the next publication repeats the cleanup, and an exception of the block has precedence.
         with suppress(OSError, FilesError):
             self._complete()
             self._clear()
@@ -141,9 +145,9 @@ class Publication:
             raise ValueError("no record") from error
 
     def _require_free(self, names: Collection[str], earlier: set[str]) -> None:
-        """Raise an error unless all folders are writable, and all names are free or those of earlier results."""
+        """Require writable folders, and no foreign entries at the paths of new files."""
         for folder in sorted(parent_folders(names)):
-            # Checked here, so that it fails before the run and not during the moves.
+            # An unwritable folder is an error here, before the run, not later during the moves.
             path = require_kind(self._directory / folder, FOLDER)
             if entry_kind(path) is not None and not os.access(path, os.W_OK):
                 raise PermissionError(errno.EACCES, f"{folder} is not a writable directory")
@@ -220,7 +224,7 @@ FILE, FOLDER = "a file", "a folder"
 
 
 def entry_kind(path: Path) -> str | None:
-    """Return the kind of a directory entry, which may be a link: FILE, FOLDER or a description; None if missing."""
+    """Return the kind of a directory entry: FILE, FOLDER or a description, such as of a link; None if missing."""
     try:
         mode = path.lstat().st_mode
     except FileNotFoundError:
@@ -236,7 +240,7 @@ def require_kind(path: Path, wanted: str) -> Path:
     """Require that an entry is of the expected kind, or missing.
 
     Args:
-        path: path of the entry.
+        path: entry of a directory; links are not followed.
         wanted: expected kind, FILE or FOLDER.
 
     Returns:
@@ -251,10 +255,10 @@ def require_kind(path: Path, wanted: str) -> Path:
 
 
 def require_no_link(folder: Path, option: str) -> Path:
-    """Require that a default folder is not a link, which may have come with the scene.
+    """Require that a default folder is not a symbolic link, possibly of an untrusted scene.
 
     Args:
-        folder: the folder, which may be missing.
+        folder: default destination, which may be missing.
         option: command-line option that selects another folder, for the remedy.
 
     Returns:
@@ -276,9 +280,9 @@ def list_files(top: Path, patterns: Collection[str], *, strict: bool, ignored: C
     """List the files below a folder whose relative paths match a pattern. Links are not followed.
 
     Args:
-        top: the folder.
+        top: root of the relative paths.
         patterns: regular expressions of relative paths; their parts before slashes match the subfolders.
-        strict: whether other entries are errors.
+        strict: whether entries without a match are errors.
         ignored: names of entries to ignore.
 
     Returns:
@@ -354,8 +358,8 @@ def _clear_abandoned(folder: Path) -> None:
         if re.fullmatch(r"\.partial-[0-9a-f]{16}", hidden.name) and entry_kind(hidden) == FOLDER:
             # Folders that are locked, incomplete, of another user or with foreign files are kept.
             with suppress(OSError, FilesError):
-                staged = r"lock|draft|picture|session|copy|animation\.(?:gif|mp4)|study\.(?:png|md|json)|sweep\.json"
-                list(list_files(hidden, [staged], strict=True))
+                pattern = r"lock|draft|picture|session|copy|animation\.(?:gif|mp4)|study\.(?:png|md|json)|sweep\.json"
+                list(list_files(hidden, [pattern], strict=True))
                 if entry_kind(hidden / LOCK_FILE) == FILE:
                     with (hidden / LOCK_FILE).open("ab", 0) as file:
                         is_abandoned = _try_lock(file)
@@ -395,7 +399,7 @@ def link_without_replacing(draft: Path, path: Path) -> bool:
 
     Args:
         draft: the file, on the same file system.
-        path: the new path; an existing file is not replaced, except without links in a race with another process.
+        path: the new path. An existing file is kept, except in a race on a file system without links.
 
     Returns:
         Whether the path was free.
@@ -414,7 +418,7 @@ def create_file(path: Path, buffering: int = -1) -> BinaryIO:
     """Create a file and open it for writing and reading.
 
     Args:
-        path: path of the file.
+        path: new path in an existing folder.
         buffering: size of the buffer [bytes], as for `open`; -1 for its default, 0 for none.
 
     Returns:
@@ -430,8 +434,8 @@ def write_new_file(path: Path, data: bytes) -> None:
     """Create a file with its content.
 
     Args:
-        path: path of the file.
-        data: the content.
+        path: new path in an existing folder.
+        data: content of the file.
 
     Raises:
         FileExistsError: when the path exists.
@@ -462,7 +466,7 @@ def _try_lock(file: BinaryIO) -> bool:
             msvcrt.locking(file.fileno(), msvcrt.LK_NBLCK, 1)
         else:
             fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except (BlockingIOError, PermissionError) as error:  # the latter on Windows
+    except (BlockingIOError, PermissionError) as error:  # PermissionError on Windows
         raise BlockingIOError(*error.args) from None
     except OSError:
         return False

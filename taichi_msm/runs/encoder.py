@@ -1,7 +1,7 @@
 """Encoding of pictures: in threads of this process, or in a child process in parallel with the simulation.
 
-Pillow releases the GIL while it encodes, but Taichi holds it while a kernel runs. With kernel launches of 25 ms, and
-PNGs of 512 x 512 pixels that take 18 ms to encode, threads lengthen a frame by 22 ms, a process by 1 ms.
+Taichi holds the GIL while a kernel runs, so threads encode only between kernels. With kernels of 25 ms and PNGs of
+512 x 512 pixels (18 ms each), encoding adds 22 ms to a frame in threads, 1 ms in a child process.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ class EncodingJob(NamedTuple):
     folders: tuple[Path, ...]  # destination of each camera
     size: tuple[int, int]  # width and height [px]
     rate: float  # frames per second
-    outputs: tuple[str, ...]  # of which png, gif and mp4 are written
+    outputs: tuple[str, ...]  # names of outputs; others than png, gif and mp4 are ignored
     background: tuple[int, int, int]  # a colour that the GIF contains exactly
     quality: int  # of the MP4 [%]
 
@@ -54,7 +54,7 @@ class EncodingReport(NamedTuple):
 
 
 class PictureWriter:
-    """Encoder of pictures in threads of this process, which a KeyboardInterrupt does not reach.
+    """Encoder of pictures in threads of this process. A KeyboardInterrupt does not reach the threads.
 
     Args:
         job: formats, destinations and size of the pictures.
@@ -110,7 +110,7 @@ class PictureWriter:
             self._files.close()
 
     def _complete_frame(self, pictures: Picture, stills: Sequence[Future[float]]) -> None:
-        """Wait for the PNGs of a frame, then append it to the videos: they have no frames without a PNG."""
+        """Append a frame to the videos once its PNGs are written, so that every frame of a video has a PNG."""
         self._seconds += sum(still.result() for still in stills)
         start = time.thread_time()
         if self._frames == 0:
@@ -163,9 +163,9 @@ class Encoder:
     def __init__(self, job: EncodingJob, inherit: tuple[int, ...] = ()) -> None:
         # With the parent's sys.path, the child imports the same package. Unlike a child of multiprocessing, it does not
         # import the caller's main module, so that scripts need no guard.
-        code = f"import sys; sys.path[:] = {sys.path!r}; from taichi_msm.runs.encoder import main; main()"
+        script = f"import sys; sys.path[:] = {sys.path!r}; from taichi_msm.runs.encoder import main; main()"
         self._process = subprocess.Popen(
-            [sys.executable, "-c", code],
+            [sys.executable, "-c", script],
             bufsize=0,
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
@@ -197,12 +197,12 @@ class Encoder:
             self._pictures.close()
             while data := self._report_pipe.read(1 << 16):
                 self._report_data += data
-            code = self._process.wait()
+            exit_code = self._process.wait()
             result = pickle.loads(self._report_data) if self._report_data else None
             if isinstance(result, Exception):
                 raise result
             if not isinstance(result, EncodingReport):
-                raise ChildProcessError(f"the encoder ended with exit code {code}")
+                raise ChildProcessError(f"the encoder ended with exit code {exit_code}")
             self._report = result
         return self._report
 
@@ -217,7 +217,7 @@ class Encoder:
 def main() -> None:
     """Run the child process: read a job and its pictures from stdin, write the report to stdout."""
     result: EncodingReport | Exception
-    # Signals to all processes of a service are ignored here: the parent closes the stream when it ends.
+    # Ignore signals that a service manager sends to all processes: this one ends when the parent closes its stdin.
     signal.signal(signal.SIGTERM, signal.SIG_IGN)
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     try:
@@ -237,7 +237,7 @@ def _encode_stream() -> EncodingReport:
     job: EncodingJob = pickle.load(sys.stdin.buffer)
     shape = len(job.folders), *reversed(job.size), 3
     size = math.prod(shape)
-    # At least a frame is queued, at most 4 pictures and 256 MiB: an interrupted run still encodes them.
+    # Queue at least one frame, at most 4 pictures and 256 MiB: an interrupted run waits for their encoding.
     writer = PictureWriter(job, max(1, min(4 // len(job.folders), (256 << 20) // size)))
     try:
         while len(data := sys.stdin.buffer.read(size)) == size:

@@ -27,7 +27,7 @@ from taichi_msm.system.files import read_regular
 
 _DIGESTS, _OVERRIDES = TypeAdapter(dict[str, str]), TypeAdapter(list[str])
 
-RESTORE_PICTURE = "put back the picture that it was run with, or run the scene again"
+RESTORE_PICTURE = "restore the original picture, or run the scene again"
 
 
 @dataclass(frozen=True)
@@ -36,10 +36,10 @@ class FinishedRun:
 
     directory: Path  # folder of the results
     status: str  # as in `RunRecord`
-    scene: Scene  # as simulated: with resolved mesh, step and precision, and picture paths from the current directory
+    scene: Scene  # with resolved mesh, step and precision, and picture paths relative to the current directory
     frames: int  # number of simulated frames
-    largest_frame: int  # with the largest displacement; the last one of runs that do not record it
-    sha256: Mapping[str, str]  # of the scene's picture files, by their keys in the scene
+    largest_frame: int  # index of the frame with the largest displacement; the last frame if unrecorded
+    sha256: Mapping[str, str]  # of picture, map and camera files, by scene key
     overrides: list[str]  # of the scene file
     _record: bytes = field(repr=False)  # content of run.json
     camera: str = ""  # camera whose pictures, labels and tracks are read; empty for an unnamed camera
@@ -56,15 +56,15 @@ class FinishedRun:
             Positions of the mass points [m], shape (frames, rows, cols, 3), read-only.
 
         Raises:
-            FilesError: when the trajectory is missing, damaged or of another run.
+            FilesError: when the trajectory is missing or damaged, or does not fit the scene.
         """
         path = self.result_path("trajectory")
         dtype = np.dtype(np.float32 if self.scene.time.precision == "f32" else np.float64)
         rest = rest_positions(self.scene.sheet)
         with reading(path):
             positions = map_array(path, "position", dtype, (self.frames, *rest.shape))
-        # A dynamic run begins with the flat sheet. Kernels and export formats need values within f32. NaN fails this
-        # comparison.
+        # A dynamic run begins with the flat sheet. Kernels and export formats need values within f32. The
+        # comparison also rejects NaN.
         largest = float(np.finfo(np.float32).max)
         starts_flat = self.scene.time.at_rest or np.array_equal(positions[0], rest.astype(dtype))
         if not starts_flat or not all(np.abs(position).max() <= largest for position in positions):
@@ -76,7 +76,7 @@ class FinishedRun:
 
         Args:
             key: entry of `output` that wrote the picture, such as "png".
-            frame: index of the frame.
+            frame: index, from 0.
 
         Returns:
             Colours, shape (height, width, 3).
@@ -95,7 +95,7 @@ class FinishedRun:
 
     @contextmanager
     def unchanged(self) -> Iterator[None]:
-        """Return a context that raises a FilesError if another run replaces the results meanwhile."""
+        """Return a context that raises a FilesError if another run replaces the results inside the block."""
         try:
             yield
         except MsmError:
@@ -104,7 +104,7 @@ class FinishedRun:
         self._require_unchanged()
 
     def _require_unchanged(self) -> None:
-        # A publication moves this file before any other.
+        # A publication first moves the earlier run.json away.
         data = b""
         with suppress(OSError):
             data = read_regular(self.directory / RUN_RECORD, MAX_RECORD_BYTES)
@@ -112,11 +112,11 @@ class FinishedRun:
             raise FilesError(f"{self.directory}: another run replaced these results while they were read; try again")
 
     def require_same_pictures(self, *, drawn: bool) -> None:
-        """Raise a FilesError if the SHA-256 of a map has changed since the run, or with `drawn` that of the picture."""
+        """Require maps, and if `drawn` also the picture, with the SHA-256 of the run; raise a FilesError otherwise."""
         for key, path in self.scene.pictures.items():
             if key == "image" and not drawn:
                 continue
-            fault = f"{path} is not the file of the run, by its SHA-256"
+            fault = f"{path} differs from the file of the run (SHA-256)"
             try:
                 if file_sha256(path) == self.sha256.get(key):
                     continue
@@ -149,7 +149,7 @@ class FinishedRun:
 
         Args:
             key: entry of `output`.
-            frame: index of the frame, if the entry writes a file per frame.
+            frame: index, from 0; ignored for entries with one file for all frames.
 
         Raises:
             FilesError: when the file is missing or is not a regular file of the run.
@@ -161,7 +161,7 @@ class FinishedRun:
         return self.require_regular_file(path, key)
 
     def require_regular_file(self, path: Path, key: str) -> Path:
-        """Require that a path leads to a regular file without passing a link, which could expose other files.
+        """Require a regular file without symbolic links on its path, which could expose other files.
 
         Args:
             path: path below the run's folder.
@@ -173,8 +173,8 @@ class FinishedRun:
         Raises:
             FilesError: when the file is missing, or an entry on the path is of another kind.
         """
-        below = path.relative_to(self.directory)
-        for inner in [*list(below.parents)[-2::-1], below]:
+        relative = path.relative_to(self.directory)
+        for inner in [*list(relative.parents)[-2::-1], relative]:
             ancestor = self.directory / inner
             with reading(ancestor):
                 kind = entry_kind(ancestor)
@@ -220,7 +220,7 @@ def reading(path: Path) -> Iterator[None]:
     except (FilesError, ImportError):
         raise
     except Exception as error:
-        # EINVAL: offsets in a damaged file may be impossible.
+        # Invalid offsets in a damaged file raise EINVAL.
         if isinstance(error, OSError) and error.errno != errno.EINVAL:
             raise FilesError(f"{path}: {(error.strerror or str(error)).lower()}") from None
         raise damaged_result(path) from None
@@ -237,7 +237,7 @@ def _read_scene(record: Mapping[str, Any]) -> Scene:
     if folder != Path.cwd():
         scene = scene.with_pictures(lambda path: str(folder / path))
     problems = [*try_plan(scene)[1], *camera_problems(scene)]
-    # Missing or changed pictures are reported by the methods that need them; the step was valid for the original map.
+    # Ignored: pictures, which later methods check when needed, and the step, which was valid for the original map.
     if any(problem.path[-1:] != ("image",) and problem.path[0] != "time" for problem in problems):
         raise SceneError([str(problem) for problem in problems])
     return scene

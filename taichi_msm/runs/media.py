@@ -35,7 +35,7 @@ TRANSPARENT_INDEX = PALETTE_SIZE
 def predict_colours(picture: Picture) -> Picture:
     """Predict typical colours of an animation, shape (n, m, 3), from its first frame, shape (height, width, 3)."""
     # A grid of at most 48 pixels per axis, at several brightnesses: the first frame shows the sheet at rest; later,
-    # parts of it turn toward the headlight or away from it.
+    # parts of the sheet turn toward the headlight or away.
     stride = -(-max(picture.shape) // 48)
     samples = picture[::stride, ::stride].astype(np.float32)
     brightnesses = (1.0, 1.0, 1.0, 1.0, 1.15, 1.3, 0.8, 0.6, 0.35, 0.15)
@@ -62,7 +62,7 @@ class Palette:
         self._background = background
         self._lookup = Image.new("P", (1, 1))
         # Pillow maps each cell of 4 x 4 x 4 colours to the palette entry nearest to the cell's darkest corner. With a
-        # palette that is half a cell darker it is the entry nearest to the cell's centre, which saves 0.8 dB of error.
+        # palette darker by half a cell, it is the entry nearest to the cell's centre: 0.8 dB less error.
         self._lookup.putpalette((np.maximum(colours, 2) - 2).tobytes())
 
     def indices(self, picture: Picture) -> Picture:
@@ -92,7 +92,7 @@ class GifWriter:
         self._palette = palette
         self._frames = 0
         self._latest: Picture | None = None
-        # Start times [1/100 s] and palette indices. Two frames are queued, because a short last one shortens the other.
+        # Start times [1/100 s] and palette indices. Two are queued, because a short last frame shortens the other.
         self._queue: deque[tuple[int, Picture]] = deque()
         self._screen: Picture | None = None
         self._file = file
@@ -202,9 +202,9 @@ class Mp4Writer:
         )
         self._stream.width, self._stream.height = (side + side % 2 for side in size)
         self._stream.pix_fmt = "yuv420p"
-        code = self._stream.codec_context
-        code.colorspace = code.color_primaries = code.color_trc = BT709
-        code.color_range = LIMITED_RANGE
+        codec = self._stream.codec_context
+        codec.colorspace = codec.color_primaries = codec.color_trc = BT709
+        codec.color_range = LIMITED_RANGE
 
     def _reopen(self, *_: object) -> BinaryIO:
         return Path(self._file.name).open("rb")

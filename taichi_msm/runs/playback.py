@@ -59,7 +59,7 @@ class Playback:
         """Draw a frame.
 
         Args:
-            frame: index of the frame.
+            frame: index, from 0.
             camera: as for `Simulation.draw`.
 
         Returns:
@@ -75,7 +75,7 @@ class Playback:
         """Compute the ground-truth labels of a frame.
 
         Args:
-            frame: index of the frame.
+            frame: index, from 0.
             camera: as for `Simulation.draw`.
 
         Returns:
@@ -84,11 +84,11 @@ class Playback:
         return self._simulation.labels(camera, *self._frame_state(frame))
 
     def flow(self, first: int, second: int, camera: CameraLike = None, camera_then: CameraLike = None) -> Flow:
-        """Compute the optical flow from a frame to another, and the occlusion of its pixels there.
+        """Compute the optical flow from one frame to another, and the occlusion of the first one's pixels there.
 
         Args:
-            first: index of the first frame.
-            second: index of the second frame; may be the first one or earlier.
+            first: index of the frame that the flow starts from.
+            second: index of the frame that the flow leads to, before or after `first` or the same.
             camera: camera of the first frame, as for `Simulation.draw`.
             camera_then: camera of the second frame; None for the same camera.
 
@@ -102,7 +102,7 @@ class Playback:
         """Project material points into the picture of a frame, and determine their occlusion.
 
         Args:
-            frame: index of the frame.
+            frame: index, from 0.
             coordinates: as for `Simulation.locate`, shape (n, 2).
             camera: as for `Simulation.draw`.
 

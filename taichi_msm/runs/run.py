@@ -51,7 +51,7 @@ from taichi_msm.version import commit
 
 
 class Stopwatch:
-    """Timer of the stages of a run, the first of which is startup. A nested stage pauses the outer one."""
+    """Timer of the stages of a run, which begins with startup. A nested stage pauses the outer one."""
 
     def __init__(self, started: float | None) -> None:
         self.seconds: dict[str, float] = {}  # time spent in each stage
@@ -92,9 +92,8 @@ def run(
 ) -> RunRecord:
     """Simulate a scene and write its results atomically.
 
-    An unfinished run of the same scene in the same directory is continued; the results have the same bits as those of
-    an uninterrupted run. It is restarted if the error is estimated and the scene has no `output`, because the estimate
-    needs all frames.
+    An unfinished run of the same scene in the directory is continued, to the same bits as without interruption. A run
+    with an error estimate but without `output` starts again, because the estimate needs all frames.
 
     Args:
         scene: the scene, from `load_scene` or as a mapping with the keys of a scene file.
@@ -102,9 +101,9 @@ def run(
             several cameras, pictures and labels go to a subfolder named after each camera.
         arch: cpu, cuda or vulkan.
         threads: number of CPU threads; None for all cores. With 1, pictures are encoded in this process, too.
-        overrides: overrides that were applied to the scene file, for run.json.
-        estimate_error: whether to estimate the error by companion runs; None if they take at most two fifths of the
-            run's time. With a tolerance in the scene, the error is always estimated.
+        overrides: overrides already applied to the scene file, for run.json.
+        estimate_error: whether to estimate the error by companion runs; None: only if they take at most two fifths of
+            the run's time. A scene with a tolerance always has an estimate.
         started: `time.perf_counter()` at the start of the program; None for now.
         progress: called often with the stage, the finished frames and the total number of frames. An exception from it
             stops the run; after a KeyboardInterrupt, finished frames are kept.
@@ -150,7 +149,9 @@ def run(
     context = _RunContext(manifest, plan, texture, device, folder)
     if unfinished := _find_unfinished(context):
         with suppress(DamagedError):
-            return _execute(context._replace(manifest=_with_versions(unfinished)), stopwatch, progress, resumes=True)
+            return _execute(
+                context._replace(manifest=_add_current_versions(unfinished)), stopwatch, progress, resumes=True
+            )
     return _execute(context, stopwatch, progress, resumes=False)
 
 
@@ -177,7 +178,7 @@ def resume(
     Raises:
         SceneError: when the scene's picture or a map cannot be decoded.
         DeviceError: when the arch is not available.
-        FilesError: when there is no run to resume or it is damaged; and as for `run`.
+        FilesError: when the unfinished run is missing or damaged; and as for `run`.
         KeyboardInterrupt: when interrupted before another frame is finished; nothing has changed then.
     """
     stopwatch = Stopwatch(started)
@@ -188,7 +189,7 @@ def resume(
     manifest.require_same_inputs(input_digests(plan), versions())
     texture = load_texture(plan.scene, manifest.sha256.get("image")) if plan.scene.draws else None
     device = runtime.start(manifest.arch, threads)
-    context = _RunContext(_with_versions(manifest), plan, texture, device, Path(directory))
+    context = _RunContext(_add_current_versions(manifest), plan, texture, device, Path(directory))
     return _execute(context, stopwatch, progress, resumes=True)
 
 
@@ -204,8 +205,8 @@ def _find_unfinished(context: _RunContext) -> Manifest | None:
     return None
 
 
-def _with_versions(manifest: Manifest) -> Manifest:
-    """Add the versions of this process, whose compiler may differ, to those of the process that began the run."""
+def _add_current_versions(manifest: Manifest) -> Manifest:
+    """Add the versions of this process to those of the original one, as both compilers may have been used."""
     return replace(manifest, versions={**manifest.versions, **versions()})
 
 
@@ -222,7 +223,7 @@ class _RunContext(NamedTuple):
 def _execute(
     context: _RunContext, stopwatch: Stopwatch, progress: StageProgressCallback, *, resumes: bool
 ) -> RunRecord:
-    """Simulate and draw all frames, or with `resumes` those that the unfinished run in the directory lacks."""
+    """Simulate, draw and publish all frames; with `resumes`, only those missing in the directory."""
     with ExitStack() as opened:
         run = _Run(context, stopwatch, progress, opened, resumes=resumes)
         run.verify_stored_frames()
@@ -300,11 +301,11 @@ class _Run:
         writer, simulation, scene = self._writer, self._simulation, self._context.plan.scene
         stage, rest = self._stopwatch.stage, rest_positions(scene.sheet)
         observed = dict.fromkeys(scene.render.all_cameras, FrameOutputs())
-        # Frames without steps are reported as a separate stage, because they distort the estimated remaining time.
+        # Frames without steps (the first one, redrawn ones) are a stage of their own: they distort the remaining time.
         redrawn_frames = max(self._resumed, 1)
         for frame in range(0 if scene.output else writer.frames, self._frames):
-            kind, total = ("redraw", redrawn_frames) if frame < redrawn_frames else ("frames", self._frames)
-            report = partial(self._progress, kind, frame, total)
+            stage_name, total = ("redraw", redrawn_frames) if frame < redrawn_frames else ("frames", self._frames)
+            report = partial(self._progress, stage_name, frame, total)
             report()
             with stage("simulate"):
                 simulation.advance(max(0, frame - simulation.frame), self._pause)
@@ -322,7 +323,7 @@ class _Run:
                     tool_forces = [simulation.forces()[tool.probe].force for tool in self._context.plan.tools]
                     forces = np.array(tool_forces).reshape(-1, 3) if frame >= self._resumed else None
                     self._error.compare_frame(position - rest, report, forces)
-        # All frames are finished; after an interruption, the estimate of the coarse companion run remains valid.
+        # An interruption here is ignored: all frames are finished, and the coarse companion run has its estimate.
         with suppress(KeyboardInterrupt):
             if self._error:
                 displacements = (writer.read_positions(frame) - rest for frame in range(1, self._frames))
@@ -410,7 +411,7 @@ class _Run:
         simulated = manifest.given.model_copy(update={"sheet": scene.sheet, "time": scene.time})
         return {
             "scene": simulated.model_dump(mode="json"),
-            "asked": _chosen_keys(manifest.given, scene),
+            "asked": _requested_values(manifest.given, scene),
             "working_directory": manifest.folder,
             "sha256": dict(manifest.sha256),
             "overrides": list(manifest.overrides),
@@ -472,15 +473,15 @@ def free_cores(plan: Plan) -> int:
     return max(1, process.available_threads() - is_encoder_busy)
 
 
-def _chosen_keys(given: Scene, scene: Scene) -> dict[str, Any]:
-    """Return the requested values of the keys that were resolved to others, by the paths of the keys."""
+def _requested_values(given: Scene, scene: Scene) -> dict[str, Any]:
+    """Return the requested values that differ from the resolved ones, by dotted key."""
     keys = ("sheet.points", "sheet.tolerance", "time.step", "time.precision", "time.tolerance")
     pairs = [(key, attrgetter(key)(given), attrgetter(key)(scene)) for key in keys]
     return {key: requested for key, requested, resolved in pairs if requested != resolved}
 
 
 def _pixels_per_metre(scene: Scene) -> float | None:
-    """Return the image scale at the centre of the sheet [px/m]; None without pictures or outside of them."""
+    """Return the image scale at the centre of the sheet [px/m]; None without pictures or with the centre outside."""
     if not scene.renders:
         return None
     centre, right, up = view_at(scene, 0.0, next(iter(scene.render.all_cameras))).pixels(

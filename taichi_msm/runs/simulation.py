@@ -43,7 +43,7 @@ from taichi_msm.solver.rest import build_dynamics
 from taichi_msm.solver.state import ProbeForces, Reading, RunProgress, Snapshot, TipForce, largest_displacement
 from taichi_msm.system import runtime
 
-# Drawing kernels that this process has compiled, by drawing two frames.
+# Drawing kernels that `Simulation.compile` has compiled in this process.
 _compiled_kernels: set[tuple[object, ...]] = set()
 
 
@@ -60,8 +60,8 @@ class Simulation:
             without a core delays all others.
 
     Raises:
-        MsmError: here and in all methods, outside the thread of the first simulation, or in a process forked after it;
-            in most methods also after `close`.
+        MsmError: here and in all methods, when called in another thread than that of the first simulation or in a
+            forked process; in most methods also after `close`.
         ArgumentError: here and in all methods, when an argument is invalid.
         DeviceError: when the arch is not available, or the compiler already runs on another arch in this process.
         SceneError: when the scene cannot be run, or no step meets its tolerance.
@@ -126,7 +126,7 @@ class Simulation:
 
     @property
     def inconsistent(self) -> bool:
-        """Whether an interruption within steps left the state inconsistent; `restore` or `restart` repair it."""
+        """Whether the state is inconsistent after an interruption within steps; `restore` or `restart` repair it."""
         return self._dynamics.inconsistent
 
     @property
@@ -148,10 +148,9 @@ class Simulation:
         """Simulate a number of frames under the loads of the scene.
 
         Args:
-            frames: number of frames, 0 or more; with 0, only the equilibrium of the first frame is solved, if the
-                scene is quasi-static.
-            pause: called several times a second between steps; an exception from it stops the simulation, which the
-                next call continues.
+            frames: number of frames, 0 or more; 0 only solves the first equilibrium of a quasi-static scene.
+            pause: called several times a second between steps. An exception from it stops the simulation; the next call
+                of `advance` continues.
 
         Raises:
             DivergedError: when a position is not finite or exceeds its bounds, or the equilibrium solver does not
@@ -167,12 +166,12 @@ class Simulation:
         """Replace the loads and tool paths from the current time on.
 
         Args:
-            probes: one entry per probe of the scene: the probe with new values, or None to keep it. A control point
-                keeps its kind of motion (moving, jumping or fixed); a force-controlled tool that will move later needs
-                keyframes in `at` from the start. A position-controlled tool takes
-                `{"path": [[t, across, down, height], ...]}` with times after `time` and moves straight from its current
-                position to the first keyframe. Its instrument, friction and grips are kept unless replaced; a grip in
-                progress continues if the new grips contain its beginning.
+            probes: one entry per probe of the scene: the probe with new values, or None for no change.
+                Force-controlled tools: a control point keeps its kind of motion (moving, jumping or fixed), so one that
+                moves later needs keyframes in `at` from the start.
+                Position-controlled tools: `{"path": [[t, across, down, height], ...]}` with times after `time`. The
+                tool moves straight from its current position to the first keyframe. Instrument, friction and grips are
+                kept by default; a grip in progress continues if the new grips contain its beginning.
 
         Raises:
             ArgumentError: when the compiled kernel does not support these probes.
@@ -225,7 +224,7 @@ class Simulation:
         before, state = self._plan, self.save().state
         plan = resolve(check_scene(scene), self.device).plan.with_probes(self.scene.probes)
         steps = self.frame * plan.grid.steps_per_frame
-        # Differences are those of a step, which the stability limit may have changed.
+        # Differences are per step, and the new stability limit may have changed the step.
         difference = state.difference * state.difference.dtype.type(plan.grid.step / before.grid.step)
         self._dynamics.restart(plan, state._replace(steps=steps, difference=difference))
         self._plan, self.renderer.scene = plan, plan.scene
@@ -245,14 +244,14 @@ class Simulation:
         return self._snapshot()
 
     def restore(self, saved: Snapshot) -> None:
-        """Continue from a saved state of the same scene, to the same bits; it may be between two frames.
+        """Continue from a saved state of the same scene, also one between two frames, to the same bits.
 
         Raises:
             ArgumentError: when the state has another mesh, precision, step or number of probes.
         """
         self._require_open()
         if not isinstance(saved, Snapshot):
-            raise ArgumentError(f"{type(saved).__name__} is not a Snapshot; take one of `save`")
+            raise ArgumentError(f"{type(saved).__name__} is not a Snapshot; take one from `save`")
         state, per_frame = saved.state, self._plan.grid.steps_per_frame
         steps_in_frame = state.steps - saved.progress.frame * per_frame
         current = self._dynamics.displacement()
@@ -286,7 +285,7 @@ class Simulation:
         return self._probe_forces
 
     def velocities(self) -> Array:
-        """Return the mean velocities of the mass points over the last step, those at half a step before `time`.
+        """Return the velocities of the mass points half a step before `time`: the means over the last step.
 
         Returns:
             Velocities [m/s], shape (rows, cols, 3), in the scene's precision; 0 at the start.
@@ -328,7 +327,7 @@ class Simulation:
             camera: name of a camera of the scene, "top", "oblique", "fit", a `Camera` or a mapping of its keys; None
                 for the scene's main camera.
             positions: positions of the mass points [m], shape (rows, cols, 3); None for the current ones.
-            time: time of these positions [s], which moves instruments and cameras; None for the current time.
+            time: time of these positions [s], for instruments and moving cameras; None for the current time.
 
         Returns:
             Colours, shape (height, width, 3).
@@ -362,8 +361,8 @@ class Simulation:
         """Compute the optical flow from another frame to this one, and the occlusion of that frame's pixels.
 
         Args:
-            before: labels of the other frame, which may be earlier or later, with the same picture size. With labels of
-                another camera, the flow leads from its picture to that of `camera`.
+            before: labels of the other frame, earlier or later, with the same picture size. If they are of another
+                camera, the flow leads from its picture to that of `camera`.
             camera: as for `draw`.
             positions: as for `draw`.
             time: as for `draw`.
@@ -379,13 +378,14 @@ class Simulation:
         """Project material points into the picture, and determine their occlusion; the inverse of `pick`.
 
         Args:
-            coordinates: fractions of the sheet's width from its left and of its height from its top, shape (n, 2).
+            coordinates: material points, shape (n, 2): fractions of the sheet's width from the left and of its height
+                from the top.
             camera: as for `draw`.
             positions: as for `draw`.
             time: as for `draw`.
 
         Returns:
-            Pixels to the right and down, shape (n, 2), and occlusion, shape (n,).
+            Pixel coordinates, x to the right and y down, shape (n, 2), and occlusion, shape (n,).
         """
         return self.renderer.locate(coordinates, self._shot(camera, positions, time))
 
@@ -397,8 +397,8 @@ class Simulation:
             camera: as for `draw`.
 
         Returns:
-            Fractions of the sheet's width from its left and of its height from its top, as in a probe's `at`; None for
-            the background.
+            Fractions of the sheet's width from the left and height from the top, as in `at` of a probe; None for the
+            background.
 
         Raises:
             ArgumentError: when `pixel` is not a pair of finite numbers.
@@ -514,7 +514,7 @@ class Simulation:
     def _require_open(self) -> None:
         # Kernels would write to freed memory.
         if self._closed:
-            raise MsmError("this simulation is closed; make another")
+            raise MsmError("this simulation is closed; build a new one")
         runtime.require_start_thread()
 
     def _shot(self, camera: CameraLike, positions: Array | None, time: float | None) -> Shot:
@@ -537,7 +537,7 @@ class Simulation:
         )
 
     def _require_no_fault(self, reading: Reading, fault: str) -> None:
-        """Raise a DivergedError if there is a fault."""
+        """Raise a DivergedError if `fault` is not empty."""
         if fault:
             steps, time = reading.steps, self._plan.grid.time(reading.steps)
             point = largest_displacement(reading.displacement)[:2]
@@ -612,6 +612,6 @@ class Player:
 def _jpeg_data_url(picture: NDArray[np.uint8]) -> str:
     """Encode a picture, shape (height, width, 3), as a data URL with a JPEG."""
     file = io.BytesIO()
-    # Differences are invisible, and hundreds of frames fit into a notebook.
+    # At this quality, artefacts are invisible, and hundreds of frames fit into a notebook.
     Image.fromarray(picture).save(file, "JPEG", quality=92)
     return f"data:image/jpeg;base64,{b64encode(file.getvalue()).decode()}"

@@ -44,15 +44,15 @@ class ResultWriter:
     """Streaming writer of the results of a run, as a context manager.
 
     Files are written to a hidden folder, and `publish` moves them into place atomically. Without `publish`, they are
-    deleted at exit. The checkpoint of a run with a manifest is kept from the first frame until complete results are
-    published. Foreign files in the directory are never changed.
+    deleted at exit. With a manifest, a checkpoint exists from the first frame to the publication of complete results.
+    Foreign files in the directory are never changed.
 
     Args:
         directory: destination of the results.
         plan: plan of the resolved scene.
         manifest: manifest of the run for its checkpoint; None for a run that cannot be resumed.
         resumes: whether to continue from the checkpoint in the directory.
-        encode_in_subprocess: whether pictures are encoded in a separate process; otherwise, `add` encodes them.
+        encode_in_subprocess: whether to encode pictures in a child process, in parallel; False: in `add`.
 
     Raises:
         FilesError: here and in all methods, when the directory cannot be written, another run writes there, or a
@@ -60,7 +60,7 @@ class ResultWriter:
 
     Attributes:
         saved: state from which the run continues; None for the initial state.
-        frames: number of frames in the results; after an interruption, only valid once `finish` has returned.
+        frames: number of frames in the results; after an interruption, valid after `finish`.
         encode_seconds: processor time of encoding pictures [s]; valid after `finish`.
     """
 
@@ -80,13 +80,13 @@ class ResultWriter:
         names = outputs.file_names(outputs.result_names(scene.folders), scene.time.frames + 1)
         with writing(directory), ExitStack() as opened:
             self._publication = opened.enter_context(Publication(directory, RUN_PUBLICATION, names))
-            staged = self._publication.new_folder
+            new_folder = self._publication.new_folder
             for name in scene.render.all_cameras if scene.renders else ():
-                (staged / name).mkdir(exist_ok=True)
-            self._labels = {name: LabelWriter(staged / name, scene, name) for name in scene.render.all_cameras}
+                (new_folder / name).mkdir(exist_ok=True)
+            self._labels = {name: LabelWriter(new_folder / name, scene, name) for name in scene.render.all_cameras}
             self._encoder: Encoder | PictureWriter | None = None
             if scene.draws:
-                folders = tuple(staged / name for name in scene.render.all_cameras)
+                folders = tuple(new_folder / name for name in scene.render.all_cameras)
                 render, rate = scene.render, scene.time.frames_per_second
                 job = EncodingJob(folders, render.size, rate, scene.output, render.background, render.quality)
                 locks = self._publication.lock_descriptors
@@ -111,7 +111,7 @@ class ResultWriter:
     def add(
         self, position: NDArray[Any], observed: Mapping[str, FrameOutputs], forces: Sequence[TipForce] = ()
     ) -> None:
-        """Add the next frame, which may be in the checkpoint already.
+        """Add the next frame. A frame of the resumed run is already in the checkpoint, and only its files are written.
 
         Args:
             position: positions of the mass points [m], shape (rows, cols, 3).
@@ -144,7 +144,7 @@ class ResultWriter:
             return self._checkpoint.save(saved)
 
     def load(self) -> Snapshot | None:
-        """Read the last saved state; None if there is none."""
+        """Read the last saved state; None without one."""
         with writing(self._directory):
             return self._checkpoint.load()
 
@@ -180,7 +180,7 @@ class ResultWriter:
         return complete_record
 
     def _write_trajectory(self) -> None:
-        """Write times [s] and positions [m] of all frames, which may exceed memory."""
+        """Write times [s] and positions [m] of all frames, in chunks, because they may exceed memory."""
         checkpoint, frames = self._checkpoint, self.frames
         shape = (frames, *self._scene.sheet.points, 3)
         arrays: dict[str, NDArray[Any] | ChunkedArray] = {
@@ -215,7 +215,7 @@ class LabelWriter:
 
     Args:
         folder: destination of the labels.
-        scene: the resolved scene.
+        scene: resolved scene, whose `output` selects the labels.
         camera: name of the camera; empty for an unnamed one.
     """
 
@@ -235,7 +235,7 @@ class LabelWriter:
         """Write the labels of a frame; tracks are kept until `finish`.
 
         Args:
-            frame: index of the frame.
+            frame: index, from 0.
             observed: labels of the camera in this frame.
             position: positions of the mass points [m], shape (rows, cols, 3).
         """
@@ -277,7 +277,7 @@ _LABEL_WRITERS: dict[str, Callable[[BinaryIO, Any], None]] = {
     ".npy": np.save,
     ".tiff": lambda file, depth: Image.fromarray(depth).save(file, "TIFF"),
     ".flo": write_flo,
-    # Masks consist of few large areas.
+    # Level 1 suffices, as masks consist of few large areas.
     ".png": lambda file, mask: Image.fromarray(mask).save(file, "PNG", compress_level=1),
 }
 
@@ -286,8 +286,8 @@ class ErrorRecord(TypedDict):
     """Error estimate of a run, relative to the largest displacement; None if unknown, for example after divergence."""
 
     error: float | None  # largest error of any mass point in any frame, due to step and rounding; None if quasi-static
-    rounding: float | None  # share of `error` due to f32; None also if the companion runs do not separate it
-    in_f64: float | None  # error of the same step in f64; None likewise
+    rounding: float | None  # share of `error` due to f32; None if not separated by the companion runs
+    in_f64: float | None  # error of the same step in f64; None as for `rounding`
     order: int | None  # of the method; None if quasi-static
     at_least: bool  # whether `error` is a lower bound
     mesh_error: NotRequired[float | None]  # discretisation error; only with tissue
@@ -301,12 +301,12 @@ class RunRecord(TypedDict, total=False):
 
     status: Literal["complete", "diverged", "interrupted"]
     error: str  # location and cause of the divergence; only if diverged
-    dump: str | None  # file with the last valid state, None if there is none; only if diverged
+    dump: str | None  # file with the last valid state, or None; only if diverged
     scene: dict[str, Any]  # as simulated, with resolved mesh, step and precision
-    asked: dict[str, Any]  # requested values that were resolved to others, by the paths of their keys
+    asked: dict[str, Any]  # requested values that differ from the resolved ones, by dotted key
     working_directory: str  # folder to which picture paths are relative
-    # Digests of the files of picture and maps by their keys in the scene, such as image and tissue.map.image. An
-    # unreadable picture that was not drawn is omitted.
+    # Digests of picture, map and camera files by scene key, such as image and tissue.map.image. An unreadable picture
+    # that is not drawn is omitted.
     sha256: dict[str, str]
     overrides: list[str]  # of the scene file
     points: list[int]  # rows and columns of mass points
@@ -333,6 +333,6 @@ class RunRecord(TypedDict, total=False):
     lanes: int  # number of SIMD lanes used for stepping; 1 on a GPU
     workers: int  # number of threads used for stepping; 0 on a GPU
     versions: dict[str, str]  # of all software that affects the results
-    commit: str | None  # of the program, by git; None if it does not run from a clone
+    commit: str | None  # git commit of the program; None without a clone
     frames: int
     outputs: list[str]  # names of files, and of folders with a file per frame

@@ -35,8 +35,8 @@ class Compiler:
     prefix: str  # prefix of its environment variables
     cache: str  # directory of compiled kernels, relative to the home directory
     lock: str  # lock file of the cache, relative to that directory
-    tested_version: str  # version whose results on a CPU have the same bits as those of the other compiler
-    python_versions: str  # python versions for which it can be installed
+    tested_version: str  # version with the same bits on a CPU as that of the other compiler
+    python_versions: str  # versions of Python with wheels of it
     # Time to poll a counter that another thread writes [s], measured on Zen 4; Taichi fences the read by `mfence`,
     # Quadrants by a locked `or`.
     poll_s: float
@@ -81,7 +81,7 @@ class Compiler:
         # In a notebook the import logs a message, and an unknown log level makes the import fail. This level applies to
         # the import only; `init` sets its own.
         level = f"{self.prefix}_LOG_LEVEL"
-        before = os.environ.get(level)
+        previous = os.environ.get(level)
         os.environ[level] = "error"
         try:
             return import_module(self.name)
@@ -89,16 +89,16 @@ class Compiler:
             raise NotInstalledError(f"{self.title} cannot be imported: {error}; {self.remedy}") from error
         finally:
             del os.environ[level]
-            if before is not None:
-                os.environ[level] = before
+            if previous is not None:
+                os.environ[level] = previous
 
     @cached_property
     def patches(self) -> Patches:
-        """Patches that are applied while a kernel of this package is parsed; empty for an untested version.
+        """Patches for faster parsing of the kernels of this package; empty for an untested version.
 
-        They omit the source lines that a compiler prepares for error messages at every node, and find the source of a
-        function once, not for each of its calls. It parses all kernels in every process, because the keys of its cache
-        depend on the parsed kernels.
+        A compiler parses all kernels in every process, because the keys of its cache depend on the parsed kernels.
+        Patched, it looks up the source of a function once, not at every call, and omits the source lines that it
+        prepares for error messages at every node.
         """
         if "TAICHI_MSM_TRACEBACK" in os.environ or self.version != self.tested_version:
             return []
@@ -115,7 +115,7 @@ class Compiler:
                 (reader, "build_stmt", read),
                 (sources, "getsourcefile", cache(sources.getsourcefile)),
                 (sources, "getsourcelines", cache(sources.getsourcelines)),
-                # Taichi wraps every line into itself.
+                # Taichi wraps every line at 9999 columns, which only removes trailing spaces.
                 (sources, "textwrap", SimpleNamespace(fill=lambda line, **_: line.rstrip(), dedent=textwrap.dedent)),
             ]
         kernels = import_module("quadrants.lang.kernel")
@@ -168,8 +168,8 @@ def active_compiler() -> Compiler:
     """
     wanted = os.environ.get(COMPILER_VARIABLE)
     if wanted and wanted not in COMPILERS:
-        near = did_you_mean(wanted, list(COMPILERS))
-        raise DeviceError(f"{COMPILER_VARIABLE}: {wanted!r} is not a compiler; take {' or '.join(COMPILERS)}{near}")
+        hint = did_you_mean(wanted, list(COMPILERS))
+        raise DeviceError(f"{COMPILER_VARIABLE}: {wanted!r} is not a compiler; take {' or '.join(COMPILERS)}{hint}")
     candidates = [COMPILERS[wanted]] if wanted else list(COMPILERS.values())
     for compiler in candidates:
         if compiler.version:
@@ -189,7 +189,7 @@ def compiler_label(versions: Mapping[str, str]) -> str:
 
 
 def result_versions(versions: Mapping[str, str], arch: str) -> dict[str, str]:
-    """Return the versions that determine the bits of results: all of them, except that of a tested compiler on a CPU.
+    """Return the versions that determine the bits of results: all except the version of a tested compiler on a CPU.
 
     Args:
         versions: as returned by `versions`.

@@ -17,7 +17,7 @@ def read_regular(path: str | Path, limit: int) -> bytes:
     """Read a regular file within a size limit, without blocking on a pipe or a device.
 
     Args:
-        path: the file; symbolic links are followed.
+        path: file or symbolic link to it.
         limit: largest size [bytes].
 
     Returns:

@@ -1,4 +1,4 @@
-"""Kernel launches with bounded loops, so that no GPU ends a thread early, and a check that none did.
+"""Kernel launches with bounded loops, because GPUs end long threads early, and a check for completion.
 
 llvmpipe ends all loops of a thread after 65,535 iterations in total, without an error; other drivers have other limits.
 So every launch states a bound of the iterations per thread, which must not grow with the picture or the sheet. An inner
@@ -23,7 +23,7 @@ VULKAN_THREADS = 1 << 17
 # Largest number of loop iterations in a thread, which also bounds the duration of a launch.
 MAX_ROUNDS = 1 << 15
 
-# Iterations, out of MAX_ROUNDS, that are reserved for loops other than that over a list.
+# Part of MAX_ROUNDS for the other loops of a kernel that iterates over a chunk of a list.
 RESERVED_ROUNDS = 1 << 8
 
 # Iterations of the loop in `end_thread`; a thread that was ended early does not complete them.
@@ -74,13 +74,13 @@ class Launches:
         return array.to_numpy() if self.bounded else array
 
     def chunks(self, length: int, rounds: int) -> Iterator[tuple[int, int]]:
-        """Split a list over which threads iterate into chunks of one launch each.
+        """Split a list, over which every thread iterates, into one chunk per launch.
 
         Args:
             length: number of entries of the list.
             rounds: largest number of loop iterations for an entry.
 
-        Returns:
+        Yields:
             The first entry and the length of each chunk; at least one chunk.
         """
         chunk = max(1, length)
@@ -94,10 +94,10 @@ class Launches:
         """Launch a kernel for all indices below `total`, split into several launches if necessary.
 
         Args:
-            kernel: takes the first index, the index after the last one, the array for `end_thread`, and the arguments.
+            kernel: kernel(first, end, ended, *arguments) for indices first to end - 1; `ended` is for `end_thread`.
             total: number of indices.
             *arguments: further arguments of the kernel.
-            rounds: largest number of iterations for an index, in all loops together.
+            rounds: largest number of loop iterations per index, over all loops.
         """
         batch = total
         if self.bounded:

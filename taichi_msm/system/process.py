@@ -1,8 +1,8 @@
 """Resources and signals of this process: cores, memory, interruption, standard streams.
 
-By default Python raises KeyboardInterrupt between any two bytecodes. Raised in an import, a destructor or a callback of
-a library, it is lost or becomes another error. Therefore Ctrl-C and SIGTERM only request an interruption, and the
-program raises it where it can stop.
+By default Python raises KeyboardInterrupt between any two bytecodes. Imports, destructors and callbacks of libraries
+lose it or convert it to another error. So Ctrl-C and SIGTERM only record a request, and the program raises
+KeyboardInterrupt at places where it can stop.
 """
 
 from __future__ import annotations
@@ -111,7 +111,7 @@ def _group_memory(group: Path) -> int:
 SIGNALS = (signal.SIGINT, signal.SIGTERM)
 
 # A descriptor of stderr that works even while `discarded_output` redirects stderr.
-_outlet = 2
+_stderr_copy = 2
 
 
 class Interruption:
@@ -143,9 +143,9 @@ class Interruption:
 
 
 def exit_on_signals() -> None:
-    """Let a signal end the process at once, for use while there are no results."""
-    global _outlet
-    _outlet = os.dup(2)
+    """End the process at once on a signal, for the time before any results exist."""
+    global _stderr_copy
+    _stderr_copy = os.dup(2)
     for number in SIGNALS:
         signal.signal(number, _exit_on_signal)
 
@@ -156,12 +156,12 @@ def _exit_on_signal(number: int, _frame: FrameType | None) -> None:
 
 def _exit(code: int, message: bytes) -> None:
     with suppress(OSError):  # stderr may be closed
-        os.write(_outlet, message)
+        os.write(_stderr_copy, message)
     os._exit(code)
 
 
 # Held while descriptors are redirected, as all threads share them.
-_redirecting = threading.RLock()
+_redirection_lock = threading.RLock()
 
 
 def open_standard_streams() -> None:
@@ -198,13 +198,13 @@ def discard_buffer(stream: TextIO) -> None:
 
 @contextmanager
 def discarded_output(*descriptors: int, into: str = os.devnull) -> Iterator[None]:
-    """Return a context in which file descriptors lead to a file, to capture or discard the output of libraries.
+    """Return a context that redirects file descriptors to a file, to capture or discard the output of libraries.
 
     Args:
         *descriptors: file descriptors such as 2 for stderr; closed ones stay closed.
-        into: file that is replaced by the output.
+        into: file for the output; an existing one is overwritten.
     """
-    with _redirecting, Path(into).open("wb") as sink:
+    with _redirection_lock, Path(into).open("wb") as sink:
         copies = {}
         for descriptor in descriptors:
             with suppress(OSError):

@@ -28,7 +28,7 @@ from taichi_msm.system.process import discarded_output
 
 ti = active_compiler().load()
 
-# The destructor of arrays that exist at exit would raise, as Taichi's modules are gone; their memory ends anyway.
+# At exit, Taichi's modules are gone before its arrays, whose destructor would raise; the memory is freed anyway.
 atexit.register(setattr, ti.lang._ndarray.ScalarNdarray, "__del__", lambda array: None)
 
 _core: Any = getattr(np, "_core", None) or np.core  # NumPy 2, or 1
@@ -60,7 +60,7 @@ class Memory:
 
     def __init__(self) -> None:
         self._arrays: list[tuple[tuple[str, int], Any]] = []
-        weakref.finalize(self, _recycle, self._arrays, _free)
+        weakref.finalize(self, _recycle, self._arrays, _free_arrays)
 
     def array(self, precision: str, lanes: int, length: int) -> Any:
         """Allocate an array, or reuse a longer one; its content is arbitrary.
@@ -74,10 +74,10 @@ class Memory:
             A Taichi array of at least `length` entries.
         """
         kind = precision, lanes
-        fitting = [array for array in _free[kind] if array.shape[0] >= length]
+        fitting = [array for array in _free_arrays[kind] if array.shape[0] >= length]
         if fitting:
             array = min(fitting, key=lambda candidate: candidate.shape[0])
-            _free[kind] = [candidate for candidate in _free[kind] if candidate is not array]
+            _free_arrays[kind] = [candidate for candidate in _free_arrays[kind] if candidate is not array]
         else:
             real = getattr(ti, precision)
             array = ti.ndarray(ti.types.vector(lanes, real) if lanes else real, length)
@@ -96,7 +96,7 @@ def write_vectors(array: Any, values: NDArray[Any]) -> None:
     array.from_numpy(np.pad(values.astype(real), ((0, array.shape[0] - len(values)), (0, 0))))
 
 
-_free: dict[tuple[str, int], list[Any]] = defaultdict(list)
+_free_arrays: dict[tuple[str, int], list[Any]] = defaultdict(list)
 
 
 def _recycle(arrays: list[tuple[tuple[str, int], Any]], free: dict[tuple[str, int], list[Any]]) -> None:
@@ -107,8 +107,8 @@ def _recycle(arrays: list[tuple[tuple[str, int], Any]], free: dict[tuple[str, in
 _device: Device | None = None
 # Ids of the process and the thread that started Taichi.
 _start_thread = (0, 0)
-# Held while Taichi starts; two threads must not start it at once.
-_starting = threading.Lock()
+# Held during the start of Taichi: two threads must not start it at once.
+_start_lock = threading.Lock()
 
 
 def lanes(precision: str) -> int:
@@ -130,7 +130,7 @@ def current_device() -> Device:
 
 
 def start(arch: str = "cpu", threads: int | None = None) -> Device:
-    """Start Taichi, unless it already runs on the same device.
+    """Start Taichi; if it already runs on the same device, only return it.
 
     Args:
         arch: cpu, cuda or vulkan.
@@ -148,10 +148,10 @@ def start(arch: str = "cpu", threads: int | None = None) -> Device:
     if threads is not None and not (type(threads) is int and 1 <= threads <= MAX_THREADS):
         raise ArgumentError(f"threads: {threads!r}; take a whole number, 1 to {MAX_THREADS}, or None for every core")
     if arch not in ARCHS:
-        near = did_you_mean(str(arch), ARCHS)
-        raise DeviceError(f"--arch {arch}: not supported; take one of: {', '.join(ARCHS)}{near}")
+        hint = did_you_mean(str(arch), ARCHS)
+        raise DeviceError(f"--arch {arch}: not supported; take one of: {', '.join(ARCHS)}{hint}")
     wanted = Device(arch, process_module.available_threads() if threads is None else threads)
-    with _starting:
+    with _start_lock:
         if _device is None:
             _device = replace(wanted, name=_initialise(wanted))
             _start_thread = os.getpid(), threading.get_ident()
@@ -165,15 +165,15 @@ def start(arch: str = "cpu", threads: int | None = None) -> Device:
 
 def stop() -> None:
     """Stop Taichi, which writes its cache of kernels; existing arrays and kernels become unusable."""
-    global _device, _free
+    global _device, _free_arrays
     # The directory of the cache may have been removed; the next process then compiles again.
     with contextlib.suppress(RuntimeError):
         ti.reset()
-    _device, _free = None, defaultdict(list)
+    _device, _free_arrays = None, defaultdict(list)
 
 
 def require_start_thread() -> None:
-    """Raise an MsmError unless this process and thread started Taichi; no others can use it."""
+    """Require the process and thread that started Taichi, the only ones that can use it; else raise an MsmError."""
     process, thread = _start_thread
     if process != os.getpid():
         raise MsmError(
@@ -181,22 +181,23 @@ def require_start_thread() -> None:
             "start processes by multiprocessing's 'spawn' or 'forkserver'"
         )
     if thread != threading.get_ident():
-        raise MsmError(f"{active_compiler().title} works in the thread that started it; simulate and draw there")
+        title = active_compiler().title
+        raise MsmError(f"{title} only works in the thread that started it; simulate and draw in that thread")
 
 
 def compilation_options(*, optimised: bool = True) -> contextlib.AbstractContextManager[None]:
-    """Set the compiler's options for the kernels of this package, but not for others in the same process.
+    """Return a context with the compiler's options for the kernels of this package; other kernels keep theirs.
 
     Every operation is rounded by IEEE 754, so that the bits of a result do not depend on threads, lanes or compiler
     optimisation. On a CPU vectors are not split into scalars (docs/decisions/0010). Taichi's control-flow optimisation
     is off: it takes half the compile time, and LLVM repeats it.
 
     Args:
-        optimised: whether Taichi applies its other optimisations before LLVM; must be the same at every launch of a
+        optimised: whether Taichi applies its other optimisations before LLVM; the same value at all launches of a
             kernel.
 
     Returns:
-        A context manager, within which kernels are launched.
+        The context manager, within which kernels are launched.
     """
     config = ti.lang.impl.current_cfg()
     options: Patches = [
@@ -220,7 +221,8 @@ def _patched(patches: Patches) -> Iterator[None]:
             setattr(owner, name, value)
 
 
-def _cache() -> dict[str, Any]:
+def _cache_options() -> dict[str, Any]:
+    """Prepare the cache of kernels; return the arguments of `ti.init` that replace it if it is unusable."""
     try:
         folder = active_compiler().folder()
         folder.mkdir(parents=True, exist_ok=True)
@@ -235,7 +237,7 @@ def _cache() -> dict[str, Any]:
         # Taichi crashes at exit if it cannot write to the directory, even if the cache is off.
         os.environ.pop(active_compiler().folder_variable, None)
         return {"offline_cache": False, "offline_cache_file_path": private_folder()}
-    # Taichi holds the lock for milliseconds. A lock older than 60 s was left by a killed process, and blocks the cache
+    # Taichi holds the lock for milliseconds. A lock older than 60 s is of a killed process, and would block the cache
     # for all others.
     lock = folder / active_compiler().lock
     with contextlib.suppress(OSError):
@@ -257,13 +259,13 @@ def _require_address_space() -> None:
         )
 
 
-def _threads() -> list[int]:
+def _thread_ids() -> list[int]:
     """Return the ids of the threads of this process, mostly in the order of their start; empty without /proc."""
     return sorted(int(task.name) for task in Path("/proc/self/task").glob("*"))
 
 
 def _pin(pool: list[int]) -> None:
-    """Pin the threads of Taichi's pool to a core each, if it has one per core; shared ones spin and wait for 10 ms."""
+    """Pin each thread of Taichi's pool to a core, if it has one per core; threads that share a core spin for 10 ms."""
     if hasattr(os, "sched_setaffinity") and len(pool) == len(os.sched_getaffinity(0)):
         for thread, core in zip(pool, sorted(os.sched_getaffinity(0)), strict=True):
             with contextlib.suppress(OSError):
@@ -274,7 +276,7 @@ def _pin(pool: list[int]) -> None:
 def _isolated_environment() -> Iterator[None]:
     """Hide environment variables that override arguments of `ti.init`, and suppress its line on stdout.
 
-    stdout itself is not redirected, because other threads may print meanwhile.
+    stdout itself is not redirected, because other threads may print to it.
     """
     prefix, namespace = f"{active_compiler().prefix}_", vars(ti.lang.misc)
     # Directories and the choice of a GPU are not arguments.
@@ -292,8 +294,8 @@ def _isolated_environment() -> Iterator[None]:
 def _initialise(device: Device) -> str:
     """Start Taichi; return the name of the processor or the GPU."""
     _require_address_space()
-    cache = _cache()
-    before = _threads()
+    cache = _cache_options()
+    earlier_threads = _thread_ids()
     on_cpu = device.arch == "cpu"
     try:
         # Only Taichi's log contains the name of the GPU. The log of a failed start is replaced by the error below.
@@ -314,7 +316,7 @@ def _initialise(device: Device) -> str:
         remedy = f"{active_compiler().title} reports: {' '.join(str(error).split())}" if on_cpu else "take --arch cpu"
         raise DeviceError(f"--arch {device.arch}: not available on this machine; {remedy}") from error
     # Taichi starts the threads of its pool last.
-    _pin([thread for thread in _threads() if thread not in before][-device.threads :])
+    _pin([thread for thread in _thread_ids() if thread not in earlier_threads][-device.threads :])
     if on_cpu:
         return process_module.processor_name()
     return next(filter(None, gpu_name.groups())) if gpu_name else ""

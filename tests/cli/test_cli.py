@@ -461,4 +461,4 @@ def test_cache_without_space(
     system = SimpleNamespace(f_files=files, f_favail=free_files, f_bavail=free_blocks, f_frsize=4096)
     monkeypatch.setattr(os, "statvfs", lambda folder: system, raising=False)
     monkeypatch.setenv(FOLDER, str(tmp_path))
-    assert (runtime._cache() == {}) == used
+    assert (runtime._cache_options() == {}) == used
