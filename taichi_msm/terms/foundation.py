@@ -221,7 +221,7 @@ def foundation_derivatives(material: Material, k: NDArray[Any], u_z: NDArray[Any
 
 
 def foundation_tangent(material: Material, k: NDArray[Any], displacement: NDArray[Any]) -> NDArray[Any]:
-    """Return the diagonal of the derivative of minus `foundation_force` [N/m], shape (rows, cols, 3).
+    """Return the diagonal of the foundation's stiffness matrix [N/m], shape (rows, cols, 3).
 
     Args:
         material: coefficients of the sheet.

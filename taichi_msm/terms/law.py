@@ -216,5 +216,5 @@ class LockingLaw(Law):
 
 
 def spring_law(stiffening: LockNumbers | None) -> Law:
-    """Return the law of springs with a lock and a factor; None for linear springs."""
+    """Return `LockingLaw`, or `LINEAR` without stiffening."""
     return LINEAR if stiffening is None else LockingLaw()
