@@ -151,7 +151,7 @@ def read_forces(path: str | Path, sigma: float, probes: int) -> ToolForces:
     if units[0].isalpha() and units[0].lower() != "nan":
         _require_units(grid.place(rows.pop(0)), units)
     for n in rows:
-        grid.require_names(n, header)
+        grid.require_width(n, header)
         if (count := grid.counts[n]) < len(names):
             fault = f"{count} of {len(names)} cells separated by {grid.separator} as in the header"
             remedy = "fill the row in, with nan where nothing was measured, or delete it"
