@@ -1,4 +1,4 @@
-"""Reader of observed points, from an .npz or a mapping of the same arrays.
+"""Reader of observed points from an .npz or a mapping of arrays.
 
 The arrays are `time` [s], shape (T,); `coordinates`, across and down as fractions of the sheet, shape (N, 2); and
 `position` [m], shape (N, T, 3), or `pixel` [px], shape (N, T, 2), NaN where not observed; optionally `sigma`, the
@@ -27,31 +27,31 @@ Arrays = dict[str, NDArray[Any]]
 NEEDS = "time (T,), coordinates (N, 2) and position (N, T, 3) or pixel (N, T, 2)"
 MEMBERS = ("time", "coordinates", "position", "pixel", "sigma", "points", "occluded", "visible")
 
-# Parts of array names that suggest data of observations.
+# Parts of array names that suggest that the array must not be ignored.
 SUGGESTIVE_PARTS = re.compile("visib|occlu|mask|valid|missing|lost|status|score|weight|confid|sigma|std|unit|scale")
 
 KINDS: dict[str, type[PointObservation]] = {"position": Positions, "pixel": Pixels}
 
 
 def read_observations(observed: str | Path | Mapping[str, Any], rate: float) -> PointObservation:
-    """Return the observed points of a file, or of a mapping of the same arrays.
+    """Return the observed points of a file or of a mapping.
 
     Args:
         observed: path of an .npz, or a mapping of array names to arrays.
-        rate: frames per second of the scene, which gives the times of a tracks.npz.
+        rate: frames per second of the scene, for the times of a tracks.npz.
 
     Raises:
-        SceneError: when arrays are missing, unknown, or have other shapes.
+        SceneError: when arrays are missing, not supported, or have wrong shapes or values.
     """
     if isinstance(observed, Mapping):
         name, names = "observed", [str(key) for key in observed]
-        _require_understood(name, names)
+        _require_supported(name, names)
         filled = (np.ma.filled(1.0 * value, np.nan) if np.ma.isMA(value) else value for value in observed.values())
         arrays = {key: as_array(value, key) for key, value in zip(names, filled, strict=True)}
     else:
         name = str(observed)
         arrays, names = _read_archive(name)
-    arrays = _thinned(_masked(name, arrays, rate))
+    arrays = _convert_trajectory(_apply_masks(name, arrays, rate))
     kinds = [kind for kind in KINDS if kind in arrays]
     missing = [key for key in ("time", "coordinates") if key not in arrays]
     if missing := missing + ([] if kinds else ["position or pixel"]):
@@ -60,14 +60,14 @@ def read_observations(observed: str | Path | Mapping[str, Any], rate: float) -> 
         raise SceneError([f"{name}: {missing[0]}: missing; expected {NEEDS}, and it has {listed}{suggestion}"])
     if len(kinds) == 2:
         raise SceneError([f"{name}: has both position and pixel; leave one of them out"])
-    return _checked(name, arrays, kinds[0]).with_sigma(arrays.get("sigma"))
+    return _build_observation(name, arrays, kinds[0]).with_sigma(arrays.get("sigma"))
 
 
-def _checked(name: str, arrays: Arrays, kind: str) -> PointObservation:
-    """Validate arrays, and build observations without sigma."""
+def _build_observation(name: str, arrays: Arrays, kind: str) -> PointObservation:
+    """Validate arrays; return the observation without sigma."""
     for key in ("time", "coordinates", kind):
         if arrays[key].dtype.kind not in "fiu":
-            raise SceneError([f"{name}: {key}: {arrays[key].dtype} is no number; expected {NEEDS}"])
+            raise SceneError([f"{name}: {key}: {arrays[key].dtype} is not numeric; expected {NEEDS}"])
     time, coordinates, values = (np.asarray(arrays[key], np.float64) for key in ("time", "coordinates", kind))
     size = 3 if kind == "position" else 2
     points, times = len(coordinates) if coordinates.ndim else 0, len(time) if time.ndim else 0
@@ -79,21 +79,21 @@ def _checked(name: str, arrays: Arrays, kind: str) -> PointObservation:
                 remedy = f"the points come first: take {key}.swapaxes(0, 1)"
             raise SceneError([f"{name}: {key}: shape {actual}; {remedy}"])
     if not np.isfinite(time).all():
-        raise SceneError([f"{name}: time: holds NaN or infinity; give the time of every column in seconds"])
+        raise SceneError([f"{name}: time: contains NaN or infinity; give all T times in seconds"])
     if not ((coordinates >= 0) & (coordinates <= 1)).all():
         message = "give across and down as fractions of the sheet, 0 to 1, from its upper left corner"
         raise SceneError([f"{name}: coordinates: {coordinates.flat[np.abs(coordinates - 0.5).argmax()]:g}; {message}"])
     # Points with a missing coordinate are not observed.
     values = np.where(np.isfinite(values).all(axis=2, keepdims=True), values, np.nan)
     if not np.isfinite(values).any():
-        fault = f"every one of the {points} points is NaN or occluded at all {times} times; there are no observations"
+        fault = f"all {points} points are NaN or occluded at all {times} times; observe at least one"
         raise SceneError([f"{name}: {fault}"])
     if (largest := np.nanmax(np.abs(values))) > MAX_MAGNITUDE:
         raise SceneError([f"{name}: {kind}: {largest:g}; take NaN where not observed"])
     return KINDS[kind](name, time, values, None, coordinates)
 
 
-def _masked(name: str, arrays: Arrays, rate: float) -> Arrays:
+def _apply_masks(name: str, arrays: Arrays, rate: float) -> Arrays:
     """Apply the masks `visible` and `occluded`, and rename the `points` of a tracks.npz to `pixel`."""
     arrays = dict(arrays)
     flags = {key: arrays.pop(key) for key in ("visible", "occluded") if key in arrays}
@@ -101,8 +101,8 @@ def _masked(name: str, arrays: Arrays, rate: float) -> Arrays:
     for flag, array in flags.items():
         shape = arrays[key].shape[:2] if key in arrays else ()
         if array.shape != shape or array.dtype.kind not in "biu" or not np.isin(array, (0, 1)).all():
-            fault = f"{array.dtype} of shape {array.shape}; take true or false for every point and time (N, T)"
-            raise SceneError([f"{name}: {flag}: {fault}, as {key} has them"])
+            fault = f"{array.dtype} of shape {array.shape}; take true or false for every point and time of {key}"
+            raise SceneError([f"{name}: {flag}: {fault}, shape (N, T)"])
         if arrays[key].dtype.kind in "fiu" and arrays[key].ndim == 3:
             arrays[key] = np.where((array != (flag == "visible"))[..., None], np.nan, arrays[key])
     if flags and key == "points":
@@ -111,8 +111,8 @@ def _masked(name: str, arrays: Arrays, rate: float) -> Arrays:
     return arrays
 
 
-def _thinned(arrays: Arrays) -> Arrays:
-    """Convert the arrays of a trajectory.npz, thinned to at most 64 points per side."""
+def _convert_trajectory(arrays: Arrays) -> Arrays:
+    """Convert the arrays of a trajectory.npz, with at most 64 points per side."""
     position = arrays.get("position")
     if position is None or position.ndim != 4 or min(position.shape[:3]) == 0 or "coordinates" in arrays:
         return arrays
@@ -126,7 +126,7 @@ def _thinned(arrays: Arrays) -> Arrays:
 
 
 def _read_archive(name: str) -> tuple[Arrays, list[str]]:
-    """Read the arrays of observations from an .npz, and the names of all its arrays."""
+    """Return the supported arrays of an .npz, and the names of all its arrays."""
     path, remedy = Path(name), f"name an .npz with {NEEDS}, or a run's trajectory.npz or tracks.npz"
     try:
         if kind := irregular_kind(path):
@@ -146,27 +146,27 @@ def _read_archive(name: str) -> tuple[Arrays, list[str]]:
     raise SceneError([f"{name}: {reason}; {remedy}"])
 
 
-def _require_understood(name: str, keys: list[str]) -> None:
-    """Raise a SceneError that lists the ignored arrays whose names suggest data of observations."""
+def _require_supported(name: str, keys: list[str]) -> None:
+    """Raise a SceneError about arrays that are not supported, but whose names suggest observations."""
     ignored = [key for key in keys if key not in MEMBERS and SUGGESTIVE_PARTS.search(key.lower())]
     if ignored:
-        fault = "not understood; take NaN where not observed, or visible or occluded (N, T), and sigma for errors"
+        fault = "not supported; take NaN where not observed, or visible or occluded (N, T), and sigma for errors"
         raise SceneError([f"{name}: {', '.join(map(ascii, ignored))}: {fault}"])
 
 
 def _read_members(name: str, archive: zipfile.ZipFile) -> tuple[Arrays, list[str]]:
     infos = {info.filename.removesuffix(".npy"): info for info in archive.infolist()}
-    _require_understood(name, list(infos))
+    _require_supported(name, list(infos))
     members = {key: info for key, info in infos.items() if key in MEMBERS}
     if (size := sum(info.file_size for info in members.values())) > (limit := available_memory() // 4):
-        fault = f"{size / 1e9:.1f} GB of arrays, and there is memory for {limit / 1e9:.1f} GB; leave some points out"
+        fault = f"{size / 1e9:.1f} GB of arrays, but memory for {limit / 1e9:.1f} GB; leave some points out"
         raise SceneError([f"{name}: {fault}"])
     arrays = {}
     for key, info in members.items():
         try:
             with archive.open(info) as member:
                 arrays[key] = np.lib.format.read_array(member, allow_pickle=False)
-        except Exception as error:  # zipfile, its decompressors and NumPy raise any kind
+        except Exception as error:  # Errors of zipfile, its decompressors and NumPy are of any kind.
             reason = "cannot be read: " + (str(error).partition("\n")[0] or type(error).__name__)
             if info.flag_bits & 1:
                 reason = "cannot be read: encrypted"

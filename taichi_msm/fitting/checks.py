@@ -15,20 +15,20 @@ from taichi_msm.scene.section import FRAME_TOLERANCE
 
 
 def faults(observations: Sequence[Observation], scene: Scene, parameters: int) -> Iterator[str]:
-    """Yield the faults that need no run: too few observations, units, times, no motion.
+    """Yield the faults found without a run: too few observations, wrong units or times, no motion.
 
     Args:
         observations: the observations.
-        scene: the scene with its initial values.
+        scene: the initial scene.
         parameters: number of parameters.
     """
     count, first = sum(int(observed.known.sum()) for observed in observations), observations[0]
     if count <= parameters:
-        fault = f"{count} numbers were observed, too few for {parameters} parameters and their errors"
-        yield f"{first.name}: {fault}; observe more points or times, or name fewer keys in --free"
+        fault = f"{count} observed numbers are too few for {parameters} parameters and their errors"
+        yield f"{first.name}: {fault}; observe more points or times, or free fewer keys"
         return
     for observed in observations:
-        yield from _times(observed.time, observed.name, scene)
+        yield from _time_faults(observed.time, observed.name, scene)
     for observed in observations:
         yield from observed.faults(scene)
     if all(observed.is_still(scene) for observed in observations):
@@ -39,27 +39,27 @@ def faults(observations: Sequence[Observation], scene: Scene, parameters: int) -
 def faults_at_start(
     observations: Sequence[Observation], scene: Scene, first: Prediction, parameters: Sequence[Parameter] = ()
 ) -> Iterator[str]:
-    """Yield the faults that a run of the scene shows: times that miss the motion, other cameras and conventions.
+    """Yield the faults found with a run of the initial scene: no motion at the times, another camera or origin, signs.
 
     Args:
         observations: the observations.
-        scene: the scene with its initial values.
-        first: prediction of the scene up to its end.
-        parameters: parameters of the fit. Those of the camera disable the checks of the camera, and linear ones that of
-            opposite signs.
+        scene: the initial scene.
+        first: prediction of the whole initial scene.
+        parameters: parameters of the fit; a free camera disables checks of the camera, a linear parameter checks of
+            signs.
     """
     rate, motion, name = scene.time.frames_per_second, float(first.motion.max()), observations[0].name
     if motion <= ROUNDING_SHARE * max(scene.sheet.size):
-        yield f"{name}: none of its points moves in the scene; give the scene probes that press near them"
+        yield f"{name}: none of its points moves in the scene; add probes that press near them"
         return
     times = np.concatenate([observed.time for observed in observations])
-    at_times = float(np.interp(times * rate, np.arange(len(first.motion)), first.motion).max())
-    if at_times < 0.1 * motion:
+    observed_motion = float(np.interp(times * rate, np.arange(len(first.motion)), first.motion).max())
+    if observed_motion < 0.1 * motion:
         moving = np.flatnonzero(first.motion > 0.5 * motion) / rate
         yield (
             f"{name}: its {len(observations[0].time)} times miss the motion: "
-            f"the scene's points move by up to {1000 * motion:.3g} mm, and at these times by {1000 * at_times:.3g} mm; "
-            f"observe between {moving[0]:g} and {moving[-1]:g} s too"
+            f"the scene's points move by up to {1000 * motion:.3g} mm, but by {1000 * observed_motion:.3g} mm then; "
+            f"add times between {moving[0]:g} and {moving[-1]:g} s"
         )
         return
     same_camera = not any(parameter.key.startswith("render.") for parameter in parameters)
@@ -74,11 +74,11 @@ def faults_at_start(
 
 
 def opposed(observations: Sequence[Observation], scene: Scene, *predictions: Prediction) -> Iterator[str]:
-    """Yield a message per observed component that has the opposite sign in all predictions.
+    """Yield a message for every component with the opposite sign in all predictions.
 
     Args:
         observations: the observations.
-        scene: the scene with its initial values.
+        scene: the initial scene.
         predictions: predictions of all observations.
     """
     for n, observed in enumerate(observations):
@@ -86,7 +86,7 @@ def opposed(observations: Sequence[Observation], scene: Scene, *predictions: Pre
 
 
 def unit_faults(observations: Sequence[Observation], *predictions: Prediction) -> Iterator[str]:
-    """Yield a message per unit that explains the ratio of observed to predicted values, for all predictions.
+    """Yield a message for every observation in another unit, if all predictions agree on it.
 
     Args:
         observations: the observations.
@@ -96,7 +96,7 @@ def unit_faults(observations: Sequence[Observation], *predictions: Prediction) -
         yield from observed.unit_faults(*(prediction.values[n] for prediction in predictions))
 
 
-def _times(time: Array, name: str, scene: Scene) -> Iterator[str]:
+def _time_faults(time: Array, name: str, scene: Scene) -> Iterator[str]:
     duration, rate = scene.time.duration, scene.time.frames_per_second
     tolerance = FRAME_TOLERANCE / rate
     low, high = float(time.min()), float(time.max())
@@ -106,6 +106,6 @@ def _times(time: Array, name: str, scene: Scene) -> Iterator[str]:
             remedy = f"are they frame numbers? divide time by the frames per second, {rate:g} in the scene"
         elif duration / 30 < high / 1000 <= duration * (1 + FRAME_TOLERANCE):
             remedy = "are they in ms? divide time by 1000"
-        yield f"{name}: time: up to {high:g} s, and the scene ends at {duration:g} s; {remedy}"
+        yield f"{name}: time: up to {high:g} s, but the scene ends at {duration:g} s; {remedy}"
     elif low < -tolerance:
-        yield f"{name}: time: from {low:g} s, and the scene begins at 0 s; let the scene's clock count"
+        yield f"{name}: time: from {low:g} s, but the scene begins at 0 s; shift the times"

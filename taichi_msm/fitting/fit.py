@@ -62,19 +62,19 @@ def fit(
             time, depth and force, which the scene's only position-controlled tool follows.
         free: keys of the parameters, as dotted paths such as tissue.young or probes.0.total.2; or tissue.map, a map
             of R x R cells, alone or with a component of a force, which scales all forces by a common factor. With
-            tables also contact, or contact.0, ... of several: the depth of contact [m of the table].
+            tables also contact, or contact.0, ... for several: the depth of contact, as in the table [m].
         bounds: smallest and largest values by key; for tissue.map, of the factors.
         forces: a forces.csv of the same motion, and the standard deviation of its forces [N].
-        directory: directory for fit.json, scene.yaml, fit.png and a map's pictures; without it nothing is written.
-        workers: number of worker processes; by default by the duration of the first run.
+        directory: directory for fit.json, scene.yaml, fit.png and a map's pictures; by default none is written.
+        workers: number of worker processes; by default chosen by the duration of the first run.
         progress: called often with the stage, the finished and the expected number of runs; an exception from it ends
             the fit, and nothing is written.
-        **method: options. Of observed points, sigma: standard deviation instead of the file's; robust: whether to
+        **method: options. For observed points, sigma: standard deviation instead of the file's; robust: whether to
             downweight outliers; profile: whether to compute profile intervals; correlation: correlation length of the
-            errors of tracks [px]; drift: correlation time of the errors of a track [s]; resolution: R of a map. Of
-            tables, columns: chosen columns, such as ["depth=Traverse, mm"]; sheet, block: chosen ones of a file;
-            window: first and last time [s]; rate: frames per second; contact: depths of contact [m of the table], one
-            for all or one per table.
+            errors of tracks [px]; drift: correlation time of the errors of a track [s]; resolution: R of a map. For
+            tables, columns: selected columns, such as ["depth=Traverse, mm"]; sheet, block: selected
+            sheet and block of a file; window: first and last time [s]; rate: frames per second; contact: depths of
+            contact, as in the tables [m], one for all or one per table.
 
     Returns:
         The estimates; `identifiable` is False if the data do not determine a parameter.
@@ -97,7 +97,7 @@ def fit(
     initial = load_scene(scene) if isinstance(scene, (str, Path)) else check_scene(scene).scene
     for section in ("sheet", "time"):
         if (tolerance := getattr(initial, section).tolerance) is not None:
-            fault = "is for one run, and a fit compares many; remove it, and take the value that `run` chose"
+            fault = "is for single runs, but a fit compares many; remove it, and take the value chosen by `run`"
             raise SceneError([f"{section}.tolerance: {tolerance:g} {fault}"])
     if repeated := [key for n, key in enumerate(free) if key in free[:n]]:
         raise SceneError([f"--free {repeated[0]}: given twice; leave one of them out"])
@@ -183,7 +183,7 @@ def _fit(runs: Runs, scene: Scene, method: Method) -> FitResult:
         if machine:
             search.remember(start, first)
         solution = search.best(start)
-    # Signs and units that contradict both the initial and the fitted scene.
+    # A wrong sign or unit contradicts both the initial and the fitted scene.
     both = first, solution.predicted
     if problems := [*opposed(observations, scene, *both), *unit_faults(observations, *both)]:
         raise SceneError(problems)
@@ -246,14 +246,14 @@ def _fit(runs: Runs, scene: Scene, method: Method) -> FitResult:
 def _search_notes(solution: Solution, parameters: Sequence[Parameter], *, fits_well: bool) -> Iterator[str]:
     """Yield warnings about the search; `fits_well`: whether the residual is small."""
     if not solution.converged:
-        yield "the search did not converge; start nearer by --set, or give --bounds"
+        yield "the search did not converge; take closer initial values by --set, or give --bounds"
     if not fits_well:
         yield "the residual is large: no values of these parameters reproduce the observations"
     for parameter, x in zip(parameters, solution.x.tolist(), strict=True):
         low, high = parameter.limits
         if min(x - low, high - x) < 1e-3:
             bounded = math.isfinite(parameter.low) or math.isfinite(parameter.high)
-            end = "a bound" if bounded else "1000 times from where it starts"
+            end = "a bound" if bounded else "a factor of 1000 from the initial value"
             yield f"{parameter.key}: ended at {parameter.value(x):.4g}, {end}: its interval is not reliable"
 
 
@@ -268,13 +268,13 @@ def _uncertainty_notes(
     half_widths = uncertainties.quantile * uncertainties.deviations
     if shifts is not None and (moved := np.flatnonzero(shifts > half_widths).tolist()):
         shares = [(parameters[n].key, parameters[n].share(x[n], float(shifts[n]))) for n in moved]
-        shifted = ", ".join(f"{key} by about {rounded(100 * share)} %" for key, share in shares)
-        yield f"the mesh changes {shifted}, more than the interval; take more sheet.points"
+        shifted_parameters = ", ".join(f"{key} by about {rounded(100 * share)} %" for key, share in shares)
+        yield f"the mesh changes {shifted_parameters}, more than the interval; take more sheet.points"
     for n, m in zip(*np.nonzero(np.triu(np.abs(uncertainties.correlation) > 0.95, 1)), strict=True):
         keys = parameters[n].key, parameters[m].key
         if not any({*keys} <= {*group.parameters} for group in unidentified):
             fault = f"{keys[0]} and {keys[1]} correlate by {uncertainties.correlation[n, m]:.3f}"
-            yield f"{fault}: they are known best together"
+            yield f"{fault}: their combination is more certain than each alone"
 
 
 def _rejection(
@@ -283,7 +283,7 @@ def _rejection(
     """Return the reason for rejecting the model, or None."""
     observations, parts = misfit.observations, misfit.split(uncertainties.residuals)
     predictions, reason = solution.predicted.values, None
-    # Outliers have full weight here, also in a robust fit.
+    # Residuals have full weight here, even outliers of a robust fit.
     name = "chi-square of the plain residuals" if misfit.robust else "chi-square"
     if all(observed.sigma is not None for observed in observations):
         total = float(uncertainties.residuals @ uncertainties.residuals)
@@ -309,10 +309,10 @@ def _larger_part(observations: Sequence[Observation], parts: Sequence[Array], pr
 def _mesh(
     runs: Runs, misfit: Misfit, solution: Solution, uncertainties: Uncertainty
 ) -> tuple[float | None, Array | None]:
-    """Estimate the mesh error, and the shifts of the parameters by it, in units of x; NaN if unknown.
+    """Return the mesh error, and the resulting shifts of the parameters in units of x, NaN if unknown.
 
-    The shifts are extrapolated with the order of convergence of three meshes, at most the expected one. A difference
-    that is small by chance is replaced by the expectation from the coarser meshes.
+    Shifts are extrapolated with the order of convergence on three meshes, limited by the expected order. A shift that
+    is small by chance on the finer meshes is replaced by the expectation from the coarser ones.
     """
     error = runs.mesh_error(solution.x)
     if error is None or (half_mesh := runs.predict_coarse(solution.x, 1)) is None:

@@ -1,6 +1,6 @@
-"""Measured forces of tools on the sheet, and the reader of a forces.csv, with any separator and decimal mark.
+"""Measured forces of tools on the sheet, and reader of forces.csv, with any separator and decimal mark.
 
-Empty cells and NaN mean "not measured"; any other cell must be a number.
+Cells are numbers, or empty or NaN where not measured.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from taichi_msm.machines.cells import Row, decimal_mark, read_text
 from taichi_msm.runs.simulation import Simulation
 from taichi_msm.scene.scene import Scene
 
-# Units of force per newton, and the largest deviation of a ratio from them, as a factor.
+# Other units per newton, and largest factor between such a unit and an observed ratio.
 UNITS_PER_NEWTON, MAX_UNIT_FACTOR = {"mN": 1000.0, "gf": 101.97, "kN": 0.001}, 3.0
 
 # Columns and their units.
@@ -32,7 +32,7 @@ EXPECTED = f"name a forces.csv, with the columns {', '.join(COLUMNS)}"
 
 @dataclass(frozen=True, eq=False)
 class Forces(Observation):
-    """Forces [N] with independent errors of known sigma; values of shape (rows, components), times of shape (rows,)."""
+    """Forces [N] with independent errors, given sigma; values of shape (rows, components), times (rows,)."""
 
     noun: ClassVar[str] = "forces"
     unit: ClassVar[str] = "N"
@@ -53,7 +53,7 @@ class Forces(Observation):
         return {"residual_force": float(np.sqrt(np.mean(residuals**2))), "sigma_force": float(np.mean(sigma))}
 
     def factor_note(self, predicted: Array) -> str:
-        """Describe a common factor of measured and predicted forces, or return an empty string."""
+        """Return a clause about a common factor of measured and predicted forces, or an empty string."""
         square = float(np.nansum(predicted**2 * self.known))
         factor = float(np.nansum(predicted * self.values)) / square if square else 1.0
         return f", which are {factor:.3g} times the predicted ones" if abs(factor - 1) > 0.02 else ""
@@ -64,8 +64,8 @@ class ForceModel(ObservationModel):
 
     Args:
         scene: scene of the run.
-        observed: measured forces, with their times and tools.
-        frames: number of frames, from the first one.
+        observed: measured forces, with times and tools.
+        frames: number of recorded frames.
     """
 
     def __init__(self, scene: Scene, observed: ToolForces, frames: int) -> None:
@@ -76,7 +76,7 @@ class ForceModel(ObservationModel):
         return np.array([tool.force for tool in simulation.forces()])
 
     def predict(self, recorded: Array) -> Array:
-        """Return the forces of all rows [N], shape (rows, 3), from those of all frames."""
+        """Return the forces of all rows [N], shape (rows, 3); `recorded`: shape (frames, probes, 3)."""
         rows, at_times = len(self._probe), self._shares @ recorded.reshape(len(recorded), -1)
         return np.asarray(at_times.reshape(rows, -1, 3)[np.arange(rows), self._probe])
 
@@ -92,21 +92,21 @@ class ToolForces(Forces):
 
     def opposed(self, scene: Scene, *predictions: Array) -> Iterator[str]:
         for axis in observation.opposed_axes(self.values, predictions, self.sigma):
-            fault = "is it the force on the tool? give the force on the sheet, of the other sign"
-            yield f"{self.name}: force_{'xyz'[axis]}: acts against the scene's; {fault}"
+            fault = "is it the force on the tool? give the force on the sheet, of opposite sign"
+            yield f"{self.name}: force_{'xyz'[axis]}: opposite to the scene's; {fault}"
 
     def unit_faults(self, *predictions: Array) -> Iterator[str]:
-        """Yield the unit of force that explains the ratio of measured to predicted forces, for all predictions."""
+        """Yield a message if another unit explains the ratio of measured forces to all predictions."""
         ratios = [self._ratio(predicted) for predicted in predictions]
         for unit, per_newton in UNITS_PER_NEWTON.items():
             if all(1 / MAX_UNIT_FACTOR < ratio / per_newton < MAX_UNIT_FACTOR for ratio in ratios):
-                fault = f"{ratios[0]:.3g} times those of the scene where the search begins; are they in {unit}?"
+                fault = f"{ratios[0]:.3g} times the forces at the initial values; are they in {unit}?"
                 remedy = f"divide them by {per_newton:g}" if per_newton > 1 else f"multiply them by {1 / per_newton:g}"
-                yield f"{self.name}: forces: {fault} {remedy}, or start nearer by --set"
+                yield f"{self.name}: forces: {fault} {remedy}, or take closer initial values by --set"
                 return
 
     def _ratio(self, predictions: Array) -> float:
-        """Return the ratio of measured to predicted forces, or 0 if they are insignificant or not parallel."""
+        """Return the ratio of measured to predicted forces, or 0 if they are small or not parallel."""
         measured, predicted = self.values[self.known], predictions[self.known]
         lengths = float(np.linalg.norm(measured)), float(np.linalg.norm(predicted))
         is_small = max(lengths) < observation.MIN_SIGMAS * self.sigma * np.sqrt(len(measured))
@@ -125,7 +125,7 @@ def read_forces(path: str | Path, sigma: float, probes: int) -> ToolForces:
         probes: number of tools of the scene.
 
     Raises:
-        SceneError: when the file is not such a table, or names a tool that the scene does not have.
+        SceneError: when the file is no valid table, or has a tool that is not in the scene.
     """
     name = str(path)
     if not 0 < sigma < math.inf:
@@ -137,34 +137,34 @@ def read_forces(path: str | Path, sigma: float, probes: int) -> ToolForces:
         best = max(range(len(named)), key=lambda n: len(named[n]))
         if missing := [key for key in COLUMNS if key not in named[best]]:
             raise SceneError([f"{name}: no row names {', '.join(missing)}; {EXPECTED}"])
-        remedy = "give each name a cell, alone or with its unit in brackets, as time [s]"
-        raise SceneError([f"{grid.place(best)}: names all columns, but not in a cell each; {remedy}"])
-    names, units = map(list, zip(*_titles(grid.rows[header]), strict=True))
+        remedy = "give every name a cell, alone or with its unit, as time [s]"
+        raise SceneError([f"{grid.place(best)}: names several columns in one cell; {remedy}"])
+    names, units = map(list, zip(*_split_titles(grid.rows[header]), strict=True))
     if repeated := [key for key in COLUMNS if names.count(key) > 1]:
         fault = f"{repeated[0]}: {names.count(repeated[0])} columns of this name; leave one"
         raise SceneError([f"{grid.place(header)}: {fault}"])
     columns = [names.index(key) for key in COLUMNS]
     _require_units(grid.place(header), [units[column] for column in columns])
     rows = [n for n in range(header + 1, len(grid.rows)) if grid.has_content(n)]
-    below = grid.rows[rows[0]] if rows else []
-    units = [below[column].strip("[]() ") if column < len(below) else "" for column in columns]
+    first_row = grid.rows[rows[0]] if rows else []
+    units = [first_row[column].strip("[]() ") if column < len(first_row) else "" for column in columns]
     if units[0].isalpha() and units[0].lower() != "nan":
         _require_units(grid.place(rows.pop(0)), units)
     for n in rows:
-        grid.require_names(n, header)
+        grid.require_width(n, header)
         if (count := grid.counts[n]) < len(names):
-            fault = f"{count} of {len(names)} cells separated by {grid.separator} as in the header"
-            remedy = "fill the row in, with nan where nothing was measured, or delete it"
+            fault = f"{count} of {len(names)} cells, separated by {grid.separator}"
+            remedy = "complete the row, with nan where not measured, or delete it"
             raise SceneError([f"{grid.place(n)}: {fault}; {remedy}"])
     cells = [(n, column) for n in rows for column in columns if column < len(grid.rows[n])]
     cells = [(n, column) for n, column in cells if grid.rows[n][column].lower() not in ("", "nan")]
     for n, column in cells:
         if grid.separator == "commas" and decimal_mark(text := grid.rows[n][column]) == ",":
-            fault = "a comma within a cell of a table separated by commas"
-            remedy = "leave it out of thousands, or, with decimal commas, separate cells by semicolons"
+            fault = "a comma within a cell, and commas between cells"
+            remedy = "write thousands without commas, or separate cells by semicolons"
             raise SceneError([f"{grid.place(n)}: {grid.rows[header][column]}: {text[:40]!r}, {fault}; {remedy}"])
     table = np.full((len(grid.rows), len(names)), np.nan)
-    remedy = "take a number, or leave the cell empty where nothing was measured"
+    remedy = "take a number, or leave the cell empty if not measured"
     for cell, (value, _) in zip(cells, grid.numbers(header, cells, remedy), strict=True):
         table[cell] = value
     table = table[np.ix_(rows, columns)]
@@ -174,7 +174,7 @@ def read_forces(path: str | Path, sigma: float, probes: int) -> ToolForces:
             raise SceneError([f"{grid.place(rows[absent[0]])}: a row without a {key}; fill it in, or delete the row"])
     if not np.isfinite(force).any():
         fault = "no force" if len(time) else "no row"
-        raise SceneError([f"{name}: {fault}; {EXPECTED}, and numbers in them"])
+        raise SceneError([f"{name}: {fault}; {EXPECTED}, and rows of numbers"])
     for n, index in zip(rows, probe.tolist(), strict=True):
         if index not in range(probes):
             raise SceneError([f"{grid.place(n)}: probe: {index:g}; the scene has {probes}, numbered from 0"])
@@ -184,18 +184,18 @@ def read_forces(path: str | Path, sigma: float, probes: int) -> ToolForces:
     return ToolForces(name, time, force, sigma, probe.astype(np.intp))
 
 
-def _titles(row: Row) -> list[tuple[str, str]]:
+def _split_titles(row: Row) -> list[tuple[str, str]]:
     """Return the names and units of columns, such as force_x [N]."""
     parts = [cell.lstrip("#% ").replace("(", "[").partition("[") for cell in row]
     return [(name.strip().lower(), unit.rstrip("]) ")) for name, _, unit in parts]
 
 
 def _is_header(row: Row) -> bool:
-    return {*COLUMNS} <= {name for name, _ in _titles(row)}
+    return {*COLUMNS} <= {name for name, _ in _split_titles(row)}
 
 
 def _require_units(where: str, units: Sequence[str]) -> None:
-    """Raise a SceneError if a column has another unit."""
+    """Raise a SceneError unless units are absent, seconds and newtons."""
     for (key, expected), unit in zip(COLUMNS.items(), units, strict=True):
         if unit not in (expected, "", "-", "1"):
             raise SceneError([f"{where}: {key}: unit {unit!r}; give seconds and newtons"])

@@ -1,7 +1,7 @@
 """Identifiability of parameters, one by one and in combinations.
 
-Images determine the ratio of a stiffness and a force, but neither of them. The singular vectors with large standard
-deviations span the unidentifiable directions; the combinations orthogonal to them are reported.
+Images determine only the ratio of stiffness to force, for example. Singular vectors with large standard deviations span
+the unidentifiable directions; combinations orthogonal to these are identifiable.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from taichi_msm.fitting.uncertainty import MAX_DIRECTION_DEVIATION, Uncertainty
 # Largest standard error of an identifiable parameter, as a share of its value or of a coordinate's range.
 MAX_RELATIVE_ERROR = 1.0
 
-# Smallest component of a parameter that belongs to a direction.
+# Smallest component of a direction along a parameter that belongs to it.
 MIN_GROUP_COMPONENT = 0.05
 
 
@@ -70,13 +70,13 @@ def unidentified_groups(
         parameters: parameters of the fit.
         x: their coordinates at the solution, shape (n,).
         uncertainties: uncertainty of the solution.
-        forces: whether forces were measured; otherwise they are the remedy.
+        forces: whether forces were measured; if not, measuring them is a remedy.
     """
     from scipy.sparse.csgraph import connected_components
 
     directions = uncertainties.directions[:, uncertainties.direction_deviations > MAX_DIRECTION_DEVIATION]
     members = np.flatnonzero(np.linalg.norm(directions, axis=1) > MIN_GROUP_COMPONENT)
-    # Parameters that share directions; the projection does not depend on the choice of their basis.
+    # Groups share directions; the projection, unlike the directions, does not depend on a basis.
     is_coupled = np.abs(directions @ directions.T) > MIN_GROUP_COMPONENT**2
     count, labels = connected_components(is_coupled[np.ix_(members, members)], directed=False)
     groups = [members[labels == label] for label in range(count)]

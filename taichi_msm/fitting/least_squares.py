@@ -17,7 +17,7 @@ from taichi_msm.errors import SceneError
 from taichi_msm.fitting.observation import Array, Observation
 from taichi_msm.fitting.predict import Prediction, Runs, difference_step
 
-# Larger residuals are downweighted in robust fits.
+# Largest residual with almost full weight in robust fits, in sigma.
 OUTLIER_SIGMAS = 2.0
 
 # Largest log of the factor between alternative starts and the first one.
@@ -34,7 +34,7 @@ class Solution:
     Attributes:
         x: coordinates of the parameters, shape (n,).
         predicted: prediction at x.
-        scales: standard deviations of the observations, with which the cost was minimised.
+        scales: standard deviations of the observations in the cost.
         cost: half the sum of rho.
         converged: whether the search has converged.
     """
@@ -51,7 +51,7 @@ class Misfit:
 
     Args:
         observations: the observations.
-        signals: root mean square of the explained part of each observation, in its unit.
+        signals: root mean square of every observation, from `Observation.signal`.
         robust: whether outliers are downweighted.
     """
 
@@ -62,7 +62,7 @@ class Misfit:
         self._observed = self._flatten([observed.values for observed in observations])
 
     def row(self, predicted: Prediction) -> Array:
-        """Return the predictions of all known values, shape (known,)."""
+        """Return the predictions of all known values as a vector, shape (known,)."""
         return self._flatten(predicted.values)
 
     def of(self, predicted: Prediction) -> Array:
@@ -93,7 +93,7 @@ class Misfit:
         return self.scaled(self.of(predicted), scales)
 
     def robust_factor(self, residuals: Array) -> Array:
-        """Return d, where rho / 2 has the derivatives r d^(-1/2) and d^(-3/2) by r."""
+        """Return d; the derivatives of rho / 2 by r are r d^(-1/2) and d^(-3/2)."""
         return 1 + (residuals / OUTLIER_SIGMAS) ** 2 if self.robust else np.ones_like(residuals)
 
     def cost(self, residuals: Array) -> float:
@@ -106,12 +106,12 @@ class Misfit:
 
         Args:
             predicted: prediction of all observations.
-            parameters: number of parameters, subtracted from the numbers of values.
+            parameters: number of parameters, for the degrees of freedom.
         """
         deviations = []
         for residuals, signal in zip(self.split(self.of(predicted)), self.signals, strict=True):
             mean_square = np.sum(residuals**2) / max(1, len(residuals) - parameters)
-            # 1.4826 is the ratio of sigma to the median of the magnitudes, of normal errors.
+            # 1.4826 converts the median magnitude of normal errors to sigma.
             sigma = 1.4826 * np.median(np.abs(residuals)) if self.robust else np.sqrt(mean_square)
             deviations.append(max(float(sigma), 1e-9 * signal))
         return deviations
@@ -130,7 +130,7 @@ class Search:
 
     Args:
         runs: predictions.
-        misfit: residuals; the initial value of an unknown sigma is the signal.
+        misfit: residuals; an unknown sigma starts at the signal.
         limits: smallest and largest coordinates, each of shape (n,); by default those of the parameters.
     """
 
@@ -142,7 +142,7 @@ class Search:
         self._neighbours: dict[bytes, Prediction | None] = {}
 
     def best(self, start: Array) -> Solution:
-        """Minimise from a start, shape (n,), and from two alternative starts if the fit is poor."""
+        """Return the best solution from a start, shape (n,), and from two alternative starts if it fits poorly."""
         solution = self.refine(start)
         if self.fits_well(solution):
             return solution
@@ -172,7 +172,7 @@ class Search:
         return self._differences(solution.x, solution.predicted, signs=self._runs.problem.signs)
 
     def remember(self, x: Array, predicted: Prediction) -> None:
-        """Store a prediction, which is then not computed again.
+        """Cache a prediction.
 
         Args:
             x: coordinates of the parameters, shape (n,).
@@ -187,7 +187,7 @@ class Search:
         return self._known[x.tobytes()]
 
     def refine(self, start: Array) -> Solution:
-        """Minimise from a start, shape (n,), alternating with an unknown sigma."""
+        """Return the minimum from a start, shape (n,); alternate with the estimation of an unknown sigma."""
         misfit = self._misfit
         is_unknown = any(observed.sigma is None for observed in misfit.observations)
         scales = misfit.scales(misfit.signals)
@@ -237,7 +237,7 @@ class Search:
         return Solution(result.x, predicted, scales, float(result.cost), bool(result.status > 0))
 
     def _differences(self, x: Array, predicted: Prediction, *, signs: tuple[int, ...]) -> Array:
-        """Return the Jacobian by differences upward, or downward at a bound; on both sides if `signs` has both."""
+        """Return the Jacobian by forward differences, backward at a bound, or central ones if `signs` has both."""
         neighbours = []
         for low, value, high, unit in zip(self._limits[0], x, self._limits[1], np.eye(len(x), dtype=bool), strict=True):
             sides = [value + self._delta] if value + self._delta <= high else []
@@ -245,7 +245,7 @@ class Search:
                 sides.append(value - self._delta)
             neighbours.append([np.where(unit, side, x) for side in sides])
         self._runs.expected = max(self._runs.expected, self._runs.count + 3 * len(x))
-        # At the end of the search, half of them are known from its last Jacobian.
+        # Central differences reuse the forward ones of the last Jacobian of the search.
         each = [neighbour for pair in neighbours for neighbour in pair]
         missing = [neighbour for neighbour in each if neighbour.tobytes() not in self._neighbours]
         computed = zip(missing, self._runs.predict_many(missing, predicted.steps), strict=True)
@@ -256,7 +256,7 @@ class Search:
             pairs = [(neighbour[n], known[neighbour.tobytes()]) for neighbour in neighbours[n]]
             points = [(side, prediction) for side, prediction in pairs if prediction is not None]
             if not points and len(signs) == 1:
-                # A downward step may succeed.
+                # A backward difference may succeed.
                 return self._differences(x, predicted, signs=(1, -1))
             if not points:
                 remedy = "give --bounds or another start by --set"

@@ -1,17 +1,17 @@
 """Fast approximation of quasi-static machine tests: one curve of elastic force over travel, relaxed in time.
 
-All elastic forces relax alike, so that the equilibrium of the tissue depends on the travel of the tool only. With f,
-the elastic force over the travel, computed at few travels and interpolated, the force of every test at frame n is
+As all elastic forces relax alike, the equilibrium of the tissue depends only on the travel of the tool. The elastic
+force f over the travel is computed at a few travels, and interpolated. The force of a test at frame n is
 
     F_n = (1 - G) f_n + sum of (s_i + share_i phi_i f_n)
 
-with shares, phi and the memory s_i of `terms/viscoelasticity.py`. Depths of contact, shares and times need no further
-curve, and log f is nearly linear in the logarithms of the other parameters, or in the reciprocal of a lock, with slopes
-from a curve each. This model is minimised within a trust region, and compared with a curve at its minimum, until it
-does not improve.
+with shares, phi and memory s_i as in `terms/viscoelasticity.py`. Depths of contact, shares and times need no further
+curve. In the other parameters, log f is linearised: in their logarithms, and in the reciprocal of a lock, with one more
+curve per parameter. This tangent is minimised within a trust region, and a curve is computed at its minimum, until the
+cost does not improve.
 
-It neglects the memory of mass points that leave the tool, and of those that slide along it. Therefore it is finally
-compared with runs of the tests, whose difference from the model is added to it. The Jacobian is that of the model.
+Curves neglect the memory of mass points that leave the tool or slide along it. Therefore the tests are finally run, and
+their difference from the tangent is added to it. The Jacobian is that of the tangent.
 """
 
 from __future__ import annotations
@@ -32,18 +32,18 @@ from taichi_msm.load.check import check_scene
 from taichi_msm.model.plan import Plan
 from taichi_msm.scene.scene import Scene
 
-# Number of travels of a curve above 0, and its reach beyond the greatest travel if depths of contact are free.
+# Number of travels of a curve above 0, and margin beyond the greatest travel if depths of contact are free, as a share.
 TRAVELS, CONTACT_MARGIN = 24, 0.05
 
-# Share of branches in the runs of a curve, with which the tissue does not relax, but has the kernels of the tests.
+# Share of every branch in the run of a curve: the tissue does not relax, but the compiled kernels are those of tests.
 NO_SHARE = 1e-12
 
-# Largest sum of the shares in the model.
+# Largest sum of the shares in a prediction.
 MAX_SHARES = 0.999
 
 
 def has_curve(problem: object) -> bool:
-    """Return whether the tests of a fit are quasi-static, and of a scene with one tool, which grips nothing."""
+    """Return whether a fit is of quasi-static machine tests, with a single tool that does not grip."""
     if not isinstance(problem, MachineProblem):
         return False
     return problem.scene.time.at_rest and len(problem.scene.probes) == 1 and not problem.scene.probes[0].grip
@@ -70,26 +70,26 @@ def relax(elastic: Array, branches: Sequence[tuple[float, float]], h: float) -> 
 
 
 class _Tangent(NamedTuple):
-    """A curve, and its dependence on the parameters."""
+    """Linearisation of a curve at x."""
 
     x: Array  # coordinates of the parameters, shape (n,)
     reach: float  # greatest travel [m]
-    forces: Array  # forces at x [N], shape (TRAVELS + 1,)
-    slopes: Array  # derivatives of their logarithms by x, shape (n, TRAVELS + 1)
+    forces: Array  # elastic forces at equidistant travels [N], shape (TRAVELS + 1,)
+    slopes: Array  # derivatives of log(forces) by x, shape (n, TRAVELS + 1)
 
 
 class CurveRuns(Runs):
-    """Predictions of machine tests by a tangent, or by curves, with a correction of every frame.
+    """Predictions of machine tests by curves, or by their tangent, with a correction at every frame.
 
     Args:
         problem: the fit.
         workers: ignored, as a curve is a single run.
-        progress: called often, as of `Runs`.
+        progress: progress callback, as for `Runs`.
 
     Attributes:
-        by_tangent: whether predictions are by the tangent; otherwise by curves.
-        of_curve: mask of the parameters on which a curve depends, shape (n,).
-        of_contact: mask of the depths of contact, shape (n,).
+        by_tangent: whether to predict by the tangent, or by curves.
+        is_of_curve: mask of the parameters that a curve depends on, shape (n,).
+        is_contact: mask of the depths of contact, shape (n,).
     """
 
     problem: MachineProblem
@@ -102,9 +102,9 @@ class CurveRuns(Runs):
         self._correction: Array | float = 0.0
         self.by_tangent = True
         keys = [parameter.key for parameter in self.problem.parameters]
-        self.of_curve = np.array([not key.startswith(("contact", "tissue.relaxation.")) for key in keys])
-        self.of_contact = np.array([key.startswith("contact") for key in keys])
-        self._of_lock = np.array([key.endswith(".lock") for key in keys])
+        self.is_of_curve = np.array([not key.startswith(("contact", "tissue.relaxation.")) for key in keys])
+        self.is_contact = np.array([key.startswith("contact") for key in keys])
+        self._is_lock = np.array([key.endswith(".lock") for key in keys])
 
     def first(self, x: Array) -> Prediction:
         self._predictor.compile(x, self._report_progress)
@@ -119,7 +119,7 @@ class CurveRuns(Runs):
         except SceneError:
             return None
         distance = x - tangent.x
-        distance = np.where(self._of_lock, -np.expm1(-distance), distance)
+        distance = np.where(self._is_lock, -np.expm1(-distance), distance)
         return self._predict(values, tangent.reach, tangent.forces * np.exp(distance @ tangent.slopes))
 
     def predict_coarse(self, x: Array, halvings: int) -> Prediction | None:
@@ -129,12 +129,12 @@ class CurveRuns(Runs):
             return None
 
     def mesh_error(self, x: Array) -> float | None:
-        # That of the run of a curve.
+        # The run of a curve stands for those of the tests.
         values = self._predictor.values(x)
         return mesh_error(self._plan_curve(values, self._reach(values)), self._report_progress)
 
     def run_curve(self, x: Array, halvings: int = 0) -> Prediction:
-        """Return the prediction by a curve; raises as `ForwardModel.predict` does.
+        """Return the prediction by a curve at x; raise the errors of `ForwardModel.predict`.
 
         Args:
             x: coordinates of the parameters, shape (n,).
@@ -145,39 +145,39 @@ class CurveRuns(Runs):
         return self._predict(values, reach, self._forces(values, reach, halvings))
 
     def run_tests(self, x: Array) -> Prediction:
-        """Return the prediction by runs of the tests at x; raises as `ForwardModel.predict` does."""
+        """Return the prediction by runs of the tests at x; raise the errors of `ForwardModel.predict`."""
         self.count += len(self.problem.tests)
         return self._predictor.predict(x, pause=self._report_progress)
 
     def correct(self, x: Array, predicted: Prediction) -> None:
-        """Correct all further predictions by the error of the tangent at a place.
+        """Correct all further predictions by the error of the tangent at x.
 
         Args:
             x: coordinates of the parameters, shape (n,).
-            predicted: prediction at x without this error.
+            predicted: exact prediction at x.
         """
         if (by_tangent := self.predict_one(x)) is not None:
             self._correction = self._correction + predicted.values[0] - by_tangent.values[0]
 
     def with_valid_shares(self, x: Array) -> Array:
-        """Return x with free shares reduced, if the sum of all shares is too large."""
+        """Return x, with the free shares scaled down if all shares sum to more than `MAX_SHARES`."""
         values = self._predictor.values(x)
         branches = self._branches(values)
         free = [key for n in range(len(branches)) if (key := f"tissue.relaxation.{n}.share") in values]
         total = sum(share for share, _ in branches)
         if total <= MAX_SHARES or not free:
             return x
-        of_free = sum(values[key] for key in free)
-        # They are reduced to a sum of 0.98, with a margin for differences.
-        reduction = np.log(max(0.98 - (total - of_free), NO_SHARE) / of_free)
+        free_total = sum(values[key] for key in free)
+        # The sum of 0.98 leaves a margin for finite differences.
+        reduction = np.log(max(0.98 - (total - free_total), NO_SHARE) / free_total)
         return x + reduction * np.array([parameter.key in free for parameter in self.problem.parameters])
 
     def set_tangent(self, x: Array) -> None:
-        """Set the tangent to the curve at x; raises as `ForwardModel.predict` does."""
+        """Linearise the curve at x; raise the errors of `ForwardModel.predict`."""
         values = self._predictor.values(x)
         reach = self._reach(values)
         forces, slopes = self._forces(values, reach), np.zeros((len(x), TRAVELS + 1))
-        for n in np.flatnonzero(self.of_curve):
+        for n in np.flatnonzero(self.is_of_curve):
             shifted, delta = x.copy(), difference_step(self.problem.scene)
             delta = delta if x[n] + delta <= self.problem.parameters[n].limits[1] else -delta
             shifted[n] += delta
@@ -192,10 +192,10 @@ class CurveRuns(Runs):
         return self._tangent.reach
 
     def _reach(self, values: dict[str, float]) -> float:
-        """Return the greatest travel of a curve [m]; raise a SceneError if no test has any."""
+        """Return the greatest travel of a curve [m]; raise a SceneError if it is 0 in all tests."""
         if not (reach := self.problem.reach(values)):
-            raise SceneError(["contact: no test goes deeper; take a smaller depth"])
-        return reach * (1 + CONTACT_MARGIN * self.of_contact.any())
+            raise SceneError(["contact: no test is deeper; take a smaller depth"])
+        return reach * (1 + CONTACT_MARGIN * self.is_contact.any())
 
     def _branches(self, values: dict[str, float]) -> list[tuple[float, float]]:
         """Return share and time [s] of every branch of relaxation."""
@@ -211,19 +211,19 @@ class CurveRuns(Runs):
 
         curve = PchipInterpolator(np.linspace(0, reach, TRAVELS + 1), forces)
         branches = self._branches(values)
-        # Larger shares are scaled, as the search would not leave a wall there.
+        # Too large shares are scaled down: an error instead would be a wall that the search cannot leave.
         scale = min(1.0, MAX_SHARES / max(sum(share for share, _ in branches), NO_SHARE))
         branches = [(scale * share, time) for share, time in branches]
-        of_tests = [
+        forces_of_tests = [
             relax(curve(loading.travel(values.get(key))), branches, 1 / loading.rate)
             for loading, key in zip(self.problem.tests, self.problem.contact_keys, strict=True)
         ]
-        return Prediction((np.concatenate(of_tests)[:, None] + self._correction,), 1, np.zeros(1))
+        return Prediction((np.concatenate(forces_of_tests)[:, None] + self._correction,), 1, np.zeros(1))
 
     def _forces(self, values: dict[str, float], reach: float, halvings: int = 0) -> Array:
-        """Run a curve; return its forces at equidistant travels [N], shape (TRAVELS + 1,)."""
-        of_curve = [value for value, matters in zip(values.values(), self.of_curve, strict=True) if matters]
-        key = (halvings, reach, *of_curve)
+        """Return the forces of a curve at equidistant travels [N], shape (TRAVELS + 1,), with a cache."""
+        curve_values = [value for value, matters in zip(values.values(), self.is_of_curve, strict=True) if matters]
+        key = (halvings, reach, *curve_values)
         if key not in self._curves:
             self._report_progress()
             simulation, plan = self._predictor.start(self._plan_curve(values, reach), None, halvings)
@@ -235,30 +235,30 @@ class CurveRuns(Runs):
         """Plan a run with equidistant travels up to `reach` [m], without relaxation."""
         data = self.problem.with_scene_values(self._predictor.data, values)
         if branches := data.get("tissue", {}).get("relaxation"):
-            no_branches = [{**branch, "share": NO_SHARE} for branch in branches]
-            data = {**data, "tissue": {**data["tissue"], "relaxation": no_branches}}
+            still_branches = [{**branch, "share": NO_SHARE} for branch in branches]
+            data = {**data, "tissue": {**data["tissue"], "relaxation": still_branches}}
         placed = self.problem.approach.place(data, np.linspace(0, reach, TRAVELS + 1), 1.0)
         return check_scene(Scene(**placed), self._predictor.maps)
 
 
 def search_by_curve(runs: CurveRuns, misfit: Misfit, start: Array, first: Prediction) -> tuple[Search, Solution]:
-    """Minimise from a start by tangents, curves, and runs of the tests.
+    """Minimise the misfit by tangents, then by curves, then by runs of the tests.
 
     Args:
         runs: predictions.
         misfit: residuals.
         start: initial coordinates of the parameters, shape (n,).
-        first: prediction at the start.
+        first: prediction at `start`.
 
     Returns:
-        The search by the last tangent, and the solution with the forces of the tests.
+        Search by the last tangent, and solution with the forces of the test runs.
 
     Raises:
-        SceneError: when the scene of a curve next to an estimate is not valid.
+        SceneError: when the scene is invalid in the neighbourhood of the solution.
         DivergedError: when the run of a curve diverges.
     """
     search = Search(runs, misfit)
-    solution = _descend(runs, misfit, _scaled(runs, misfit, start, first), by_tests=False)
+    solution = _descend(runs, misfit, _scale_stiffnesses(runs, misfit, start, first), by_tests=False)
     starts = []
     if not search.fits_well(solution):
         costs = []
@@ -266,10 +266,10 @@ def search_by_curve(runs: CurveRuns, misfit: Misfit, start: Array, first: Predic
             if (predicted := runs.predict_coarse(x, 0)) is not None:
                 costs.append((misfit.cost(misfit.residuals(predicted, solution.scales)), x.tolist()))
         starts = [np.array(x) for _, x in sorted(costs)[:2]]
-    # A lock or factor beyond the measured forces has no effect, but may fit better at a smaller value, which has one.
-    # Then the forces change by less than 3 sigma per unit of x.
+    # A lock or factor beyond the measured range has no effect there, with less than 3 sigma per unit of x, but may fit
+    # better at a smaller value.
     information = np.linalg.norm(misfit.scaled(search.jacobian(solution), solution.scales), axis=0)
-    for n in np.flatnonzero(runs.of_curve & (information < 3.0)):
+    for n in np.flatnonzero(runs.is_of_curve & (information < 3.0)):
         starts.append(solution.x.copy())
         starts[-1][n] = max(start[n] - 1, runs.problem.parameters[n].limits[0])
     for x in starts:
@@ -281,8 +281,8 @@ def search_by_curve(runs: CurveRuns, misfit: Misfit, start: Array, first: Predic
     return Search(runs, misfit), solution
 
 
-def _scaled(runs: CurveRuns, misfit: Misfit, x: Array, initial: Prediction) -> Array:
-    """Scale the stiffnesses so that the `initial` forces have the size of the measured ones."""
+def _scale_stiffnesses(runs: CurveRuns, misfit: Misfit, x: Array, initial: Prediction) -> Array:
+    """Scale the stiffnesses of x by the ratio of measured to `initial` forces."""
     predicted = misfit.row(initial)
     measured = predicted - misfit.of(initial)
     ratio = np.linalg.norm(measured) / max(float(np.linalg.norm(predicted)), 1e-300)
@@ -292,7 +292,7 @@ def _scaled(runs: CurveRuns, misfit: Misfit, x: Array, initial: Prediction) -> A
 
 
 def _descend(runs: CurveRuns, misfit: Misfit, start: Array, *, by_tests: bool) -> Solution:
-    """Minimise the tangent within a trust region, and evaluate its minimum by a curve or the tests, repeatedly."""
+    """Minimise the tangent within a trust region, evaluate its minimum by a curve or the tests, and repeat."""
     scales = misfit.scales(misfit.signals)
 
     def evaluate(x: Array) -> Solution:
@@ -300,12 +300,12 @@ def _descend(runs: CurveRuns, misfit: Misfit, start: Array, *, by_tests: bool) -
         return Solution(x, predicted, scales, misfit.cost(misfit.residuals(predicted, scales)), converged=False)
 
     def is_at_end(cost: float, current: float) -> bool:
-        # A change of the cost of 0.05 is that by a third of a standard deviation of a parameter.
+        # A third of a standard deviation of a parameter changes the cost by 0.05.
         return abs(current - cost) <= max(1e-3 * current, 0.05)
 
     current = evaluate(start)
-    # The trust region of the parameters of a curve is at first 0.5, and at most 2, in units of x.
-    trial, region = current, np.where(runs.of_curve, 0.5, np.inf)
+    # The trust region of curve parameters starts at 0.5, and grows to 2 at most, in units of x.
+    trial, region = current, np.where(runs.is_of_curve, 0.5, np.inf)
     for step in range(20):
         if step and is_at_end(trial.cost, current.cost):
             return replace(min(trial, current, key=lambda each: each.cost), converged=True)
@@ -313,10 +313,14 @@ def _descend(runs: CurveRuns, misfit: Misfit, start: Array, *, by_tests: bool) -
             if not by_tests:
                 runs.set_tangent(trial.x)
             runs.correct(trial.x, trial.predicted)
-            current, region = trial, np.minimum(2 * region, np.where(runs.of_curve, 2.0, np.inf))
+            current, region = trial, np.minimum(2 * region, np.where(runs.is_of_curve, 2.0, np.inf))
         else:
             shrunk = np.minimum(region, np.abs(trial.x - current.x)) / 4
-            region = shrunk if by_tests else np.where(runs.of_curve, shrunk.max(where=runs.of_curve, initial=0), region)
+            region = (
+                shrunk
+                if by_tests
+                else np.where(runs.is_of_curve, shrunk.max(where=runs.is_of_curve, initial=0), region)
+            )
         limits = _limits(runs, current.x, region)
         starts = [current.x] if by_tests or step else [current.x, *_relaxation_starts(runs, misfit, current, limits)]
         minimum = min((Search(runs, misfit, limits).refine(x) for x in starts), key=lambda each: each.cost)
@@ -330,16 +334,16 @@ def _descend(runs: CurveRuns, misfit: Misfit, start: Array, *, by_tests: bool) -
 
 
 def _limits(runs: CurveRuns, x: Array, region: Array) -> tuple[Array, Array]:
-    """Return the bounds of x within the trust region, and of depths of contact within the reach of the curve."""
+    """Return the bounds of x, which keep depths of contact within the reach of the curve."""
     low, high = runs.problem.limits
     margin = np.array([CONTACT_MARGIN * runs.reach / (parameter.scale or 1) for parameter in runs.problem.parameters])
-    below = np.where(runs.of_contact, np.minimum(region, margin), region)
+    below = np.where(runs.is_contact, np.minimum(region, margin), region)
     return np.maximum(low, x - below), np.minimum(high, x + region)
 
 
 def _relaxation_starts(runs: CurveRuns, misfit: Misfit, current: Solution, limits: tuple[Array, Array]) -> list[Array]:
-    """Return the two best of 64 starts of the parameters that need no curve, within a factor of 10."""
-    free = np.flatnonzero(~runs.of_curve)
+    """Return the two best of 64 starts that vary the parameters without a curve by a factor of at most 10."""
+    free = np.flatnonzero(~runs.is_of_curve)
     if not len(free):
         return []
     from scipy.stats import qmc

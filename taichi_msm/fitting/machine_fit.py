@@ -13,17 +13,17 @@ from taichi_msm.fitting.observation import Array
 from taichi_msm.fitting.parameters import rounded
 from taichi_msm.machines.loading import CONTACT_NOISES, Loading
 
-# The tool is held while the depth differs by at most this share of the travel.
+# Largest change of the depth while the tool is held, as a share of the travel.
 HELD_SHARE = 0.02
 
 
 @dataclass(frozen=True, eq=False)
 class FittedTest:
-    """A machine test, and the forces of the fitted scene.
+    """Machine test with the forces of the fitted scene.
 
     Attributes:
-        loading: the test at the frames of its scene.
-        contact: depth of contact, fitted or of the test [m of the table].
+        loading: the test, sampled at frames.
+        contact: depth of contact, fitted or given, as in the table [m].
         force: fitted force at every frame [N], shape (frames,).
     """
 
@@ -33,12 +33,12 @@ class FittedTest:
 
     @property
     def residual(self) -> float:
-        """Root mean square of the residual over the frames [N]."""
+        """Root mean squares_by_shift of the residual over the frames [N]."""
         return float(np.sqrt(np.mean((self.force - self.loading.force) ** 2)))
 
     @property
     def rise(self) -> float:
-        """Time between contact and the largest force [s]."""
+        """Time from contact to the largest force [s]."""
         loading = self.loading
         in_contact = loading.travel(self.contact) > 0
         return float(loading.time[loading.force.argmax()] - loading.time[in_contact.argmax()])
@@ -72,11 +72,11 @@ def fitted_tests(problem: MachineProblem, values: Mapping[str, float], forces: A
 
 
 def unknown_notes(tests: Sequence[FittedTest], values: Mapping[str, float]) -> Iterator[str]:
-    """Yield the reasons for parameters that the tests do not identify.
+    """Yield the reasons why parameters are not identifiable.
 
     Args:
         tests: the fitted tests.
-        values: values of these parameters by key.
+        values: values of the unidentifiable parameters by key.
     """
     for key, value in values.items():
         if key.startswith("tissue.relaxation.") and key.endswith(".time"):
@@ -95,11 +95,11 @@ def unknown_notes(tests: Sequence[FittedTest], values: Mapping[str, float]) -> I
 
 
 def explanations(tests: Sequence[FittedTest], *, fits_contact: bool) -> Iterator[str]:
-    """Yield the reasons for a rejected model that tables show: relaxation, contact, curvature, or a sign.
+    """Yield probable reasons for the rejection of a model: relaxation, contact, curvature, or a sign.
 
     Args:
         tests: the fitted tests.
-        fits_contact: whether depths of contact are parameters, and therefore no reason.
+        fits_contact: whether depths of contact are fitted, which excludes them as a reason.
     """
     for fitted in tests:
         if reason := _explain(fitted, fits_contact=fits_contact):
@@ -107,10 +107,10 @@ def explanations(tests: Sequence[FittedTest], *, fits_contact: bool) -> Iterator
 
 
 def _explain(fitted: FittedTest, *, fits_contact: bool) -> str:
-    """Return the reason for the residual of a test, or an empty text."""
+    """Return a probable reason for the residual of a test, or an empty string."""
     loading, predicted = fitted.loading, fitted.force
     if float(predicted @ loading.force) < 0:
-        return "the measured force acts against the model's: is the sign of the path, or of a column, wrong?"
+        return "the measured and the fitted force are opposite: is the sign of the path, or of a column, wrong?"
     test, travel = loading.test, loading.travel(fitted.contact)
     peak = int(test.force.argmax())
     reach = float(travel.max())
@@ -121,31 +121,33 @@ def _explain(fitted: FittedTest, *, fits_contact: bool) -> str:
     model_fall = 1 - float(at_ends[1] / at_ends[0]) if last > peak and at_ends[0] > 0 else 0.0
     if fall > 0.05 and model_fall < 0.5 * fall:
         return (
-            f"the force falls by {100 * fall:.0f} % while the tool is held, and the model's by "
-            f"{100 * max(model_fall, 0.0):.0f} %: relaxation? Free the shares and times of tissue.relaxation"
+            f"the force falls by {100 * fall:.0f} % while the tool is held, the fitted force by "
+            f"{100 * max(model_fall, 0.0):.0f} %: free the shares and times of tissue.relaxation"
         )
     at_peak = float(travel[loading.force.argmax()])
     rising = slice(0, int(np.argmax(travel >= (1 - HELD_SHARE) * at_peak)) + 1)
-    if not fits_contact and at_peak and (reason := _explain_by_contact(fitted, rising)):
+    if not fits_contact and at_peak and (reason := _explain_by_another_contact(fitted, rising)):
         return reason
     depth, measured, model = travel[rising], loading.force[rising], predicted[rising]
-    halves = [float(np.interp(0.5 * depth[-1], np.maximum.accumulate(depth), force)) for force in (measured, model)]
-    shares = [100 * half / float(force[-1]) for half, force in zip(halves, (measured, model), strict=True)]
+    half_forces = [
+        float(np.interp(0.5 * depth[-1], np.maximum.accumulate(depth), force)) for force in (measured, model)
+    ]
+    shares = [100 * half / float(force[-1]) for half, force in zip(half_forces, (measured, model), strict=True)]
     if abs(shares[0] - shares[1]) <= 4:
         return ""
     comparison = "more" if shares[0] < shares[1] else "less"
     return (
-        f"at half the depth the force is {rounded(shares[0])} % of that at the peak, and the model's "
-        f"{rounded(shares[1])} %: the tissue stiffens {comparison} with the depth: lock? Free or change it"
+        f"at half the depth the force is {rounded(shares[0])} % of the peak, the fitted force {rounded(shares[1])} %: "
+        f"the tissue stiffens {comparison} with the depth: free or change a lock"
     )
 
 
-def _explain_by_contact(fitted: FittedTest, rising: slice) -> str:
-    """Return the reason of another depth of contact, or an empty text; `rising`: frames up to the peak.
+def _explain_by_another_contact(fitted: FittedTest, rising: slice) -> str:
+    """Return whether another depth of contact explains the residual, as a sentence or an empty string.
 
-    The fit has adapted the stiffness to its contact. So the measured force is compared with the model's curve, shifted
-    in depth, times a factor, plus a constant if the contact is later: the friction or weight of a slack. Another
-    curvature, a factor linear in depth with such a constant, must explain less.
+    The fitted stiffness depends on the assumed contact. Therefore the measured forces of the frames `rising`, up to the
+    peak, are fitted by the model's forces, shifted in depth and scaled; a later contact adds a constant, the friction
+    or weight of a slack. The same model without shift, but with a factor linear in depth, must fit worse.
     """
     loading = fitted.loading
     travel, place = loading.travel(fitted.contact)[rising], loading.depth[rising] - fitted.contact
@@ -154,29 +156,29 @@ def _explain_by_contact(fitted: FittedTest, rising: slice) -> str:
     end_slope = (model[-1] - np.interp(0.9 * reach, travel, model)) / (0.1 * reach)
 
     def fit_shifted(shift: float) -> tuple[float, Array]:
-        # The curve is linear beyond its end.
+        # Extrapolate linearly beyond the greatest travel.
         curve = np.interp(place - shift, travel, model) + end_slope * np.maximum(place - shift - reach, 0.0)
         return _fit_linear(measured, curve, *([is_pressed] if shift > 0 else []))
 
     shift = 0.0
     for shifts in (np.linspace(-0.5, 0.9, 141), np.linspace(-0.01, 0.01, 41)):
         shift = min((shift + reach * shifts).tolist(), key=lambda shift: fit_shifted(shift)[0])
-    square, coefficients = fit_shifted(shift)
-    square_by_curvature, _ = _fit_linear(measured, model, model * travel, is_pressed)
-    explained = 1 - square / max(float((model - measured) @ (model - measured)), 1e-300)
-    if abs(shift) <= 0.02 * reach or explained <= 0.7 or square >= square_by_curvature:
+    squares_by_shift, coefficients = fit_shifted(shift)
+    squares_by_curvature, _ = _fit_linear(measured, model, model * travel, is_pressed)
+    explained = 1 - squares_by_shift / max(float((model - measured) @ (model - measured)), 1e-300)
+    if abs(shift) <= 0.02 * reach or explained <= 0.7 or squares_by_shift >= squares_by_curvature:
         return ""
     slack = ""
     if shift > 0 and coefficients[1] > CONTACT_NOISES * loading.noise:
         slack = f" after a slack with {coefficients[1]:.2g} N"
     return (
-        f"a contact at {fitted.contact + shift:.4g} m of the table, not {fitted.contact:.4g} m,{slack} would explain "
+        f"a contact at {fitted.contact + shift:.4g} m of the table, not {fitted.contact:.4g} m,{slack} explains "
         f"{rounded(100 * explained)} % of the residual: give --contact, or --free contact"
     )
 
 
 def _fit_linear(values: Array, *columns: Array) -> tuple[float, Array]:
-    """Return the sum of squared residuals of a linear fit of values, and its coefficients."""
+    """Return the sum of squared residuals, and the coefficients, of a linear fit of `values` by `columns`."""
     matrix = np.stack(columns, axis=1)
     coefficients = np.asarray(np.linalg.lstsq(matrix, values, rcond=None)[0], np.float64)
     return float(((values - matrix @ coefficients) ** 2).sum()), coefficients

@@ -1,4 +1,4 @@
-"""Fit of machine tests: a run per test with the same parameters, and the forces at its frames."""
+"""Forward model of machine tests, with a run per test and common parameters; reader of their tables and options."""
 
 from __future__ import annotations
 
@@ -24,16 +24,16 @@ from taichi_msm.scene.scene import Scene
 
 TABLE_SUFFIXES = (".csv", ".tsv", ".txt", ".xlsx")
 
-# Options of `fit` for tables, and those for observed points.
+# Options of `fit` for tables only, and for observed points only.
 TABLE_OPTIONS = ("columns", "sheet", "block", "window", "rate", "contact")
 POINT_OPTIONS = ("sigma", "correlation", "drift", "resolution")
 
 
 @dataclass(frozen=True, eq=False)
 class MachineForces(Forces, ObservationModel):
-    """Forces along the direction of the tool at the frames of all tests; values of shape (frames of all tests, 1).
+    """Forces along the tool's direction [N] of all tests; values of shape (frames of all tests, 1).
 
-    It is also the map from the run of a test to its forces.
+    The observation is its own model: the map from the run of a test to these forces.
     """
 
     approach: Approach
@@ -46,7 +46,7 @@ class MachineForces(Forces, ObservationModel):
         return np.array(simulation.forces()[self.approach.probe].force)
 
     def predict(self, recorded: Array) -> Array:
-        """Return the forces along the direction of the tool at all frames of a test [N], shape (frames, 1)."""
+        """Return the forces of a test along the tool's direction [N], shape (frames, 1)."""
         return np.asarray(recorded @ self.approach.direction[:, None])
 
 
@@ -55,11 +55,11 @@ class MachineProblem(FitProblem):
     """Scene, parameters and machine tests of a fit.
 
     Attributes:
-        tests: the tests at their frames.
-        approach: line of the tool.
+        tests: tests, sampled at frames.
+        approach: straight path of the tool.
     """
 
-    # Forward differences suffice for many frames of smooth forces.
+    # Forward differences are sufficient for smooth forces at many frames.
     signs: ClassVar[tuple[int, ...]] = (1,)
 
     tests: tuple[Loading, ...]
@@ -74,10 +74,10 @@ class MachineProblem(FitProblem):
         return MachineModel(self, threads)
 
     def fitted_data(self, data: dict[str, Any], values: Mapping[str, float], n: int = 0) -> dict[str, Any]:
-        """Return a scene's data with parameter values, and with the path and the times of a test.
+        """Return a scene's data with parameter values, and with path and times of a test.
 
         Args:
-            data: data of a scene, as of `as_data`.
+            data: data of a scene, from `as_data`.
             values: values of all parameters by key.
             n: index of the test.
         """
@@ -86,23 +86,23 @@ class MachineProblem(FitProblem):
         return self.approach.place(data, test.travel(contact), test.rate)
 
     def with_scene_values(self, data: dict[str, Any], values: Mapping[str, float]) -> dict[str, Any]:
-        """Return a scene's data with parameter values, but without a test.
+        """Return a scene's data with parameter values, and its own path and times.
 
         Args:
-            data: data of a scene, as of `as_data`.
+            data: data of a scene, from `as_data`.
             values: values of all parameters by key; depths of contact are ignored.
         """
         of_scene = [parameter for parameter in self.parameters if parameter.key not in self.contact_keys]
         return with_values(data, of_scene, values)
 
     def reach(self, values: Mapping[str, float]) -> float:
-        """Return the greatest travel of all tests [m] with parameter values by key."""
+        """Return the greatest travel of all tests [m]; `values`: parameter values by key."""
         pairs = zip(self.tests, self.contact_keys, strict=True)
         return max(float(test.travel(values.get(key)).max()) for test, key in pairs)
 
 
 class MachineModel(ForwardModel):
-    """Forward model of machine tests; predicts `MachineForces`, of shape (frames of all tests, 1)."""
+    """Forward model that runs every machine test and predicts `MachineForces`, shape (frames of all tests, 1)."""
 
     problem: MachineProblem
 
@@ -112,7 +112,7 @@ class MachineModel(ForwardModel):
         steps: int | None = None,
         *,
         coarse: int = 0,
-        to_end: bool = False,  # The runs end with their tests.
+        to_end: bool = False,  # Ignored: every run ends with its test.
         pause: Pause = lambda: None,
     ) -> Prediction:
         forces, most_steps = [], 0
@@ -128,7 +128,7 @@ class MachineModel(ForwardModel):
 
         Args:
             simulation: simulation at its first frame.
-            plan: its plan.
+            plan: plan of the simulation.
             pause: called several times a second.
         """
         (observed,) = self.problem.observations
@@ -139,23 +139,23 @@ class MachineModel(ForwardModel):
 
 
 def contact_keys(count: int) -> list[str]:
-    """Return the keys of the depths of contact of a number of tests."""
+    """Return the keys of the depths of contact of `count` tests."""
     return ["contact"] if count == 1 else [f"contact.{n}" for n in range(count)]
 
 
 def is_table(path: object) -> bool:
-    """Return whether a path is that of a table of a testing machine, by its suffix."""
+    """Return whether the suffix of a path is that of a machine table."""
     return isinstance(path, (str, Path)) and str(path).lower().endswith(TABLE_SUFFIXES)
 
 
 def table_paths(observed: Any) -> list[str]:
-    """Return the paths of tables; an empty list for other observations; raise a SceneError for both."""
+    """Return the paths of tables, or an empty list for other observations; raise a SceneError for a mixture."""
     paths = [observed] if isinstance(observed, (str, Path)) or not isinstance(observed, Sequence) else list(observed)
     others = [path for path in paths if not is_table(path)]
     if len(others) == len(paths) == 1:
         return []
     if others or not paths:
-        fault = "of several files, each must be a table of a testing machine"
+        fault = "only tables of a testing machine can be several"
         raise SceneError([f"{others[0] if others else 'observed'}: {fault}, {', '.join(TABLE_SUFFIXES)}"])
     return [str(path) for path in paths]
 
@@ -168,28 +168,28 @@ def read_machine_problem(
     forces: object,
     method: Method,
 ) -> MachineProblem:
-    """Return the fit of the tables of a testing machine.
+    """Return the fit problem of machine tables.
 
     Args:
         paths: paths of the tables.
         scene: the scene with its initial values.
         free: keys of the parameters.
         bounds: smallest and largest values by key.
-        forces: forces of another file, which raise an error, or None.
+        forces: value of --forces, must be None.
         method: options of `fit`.
 
     Raises:
         SceneError: when a table, the scene or an option is invalid.
     """
     if forces is not None:
-        raise SceneError([f"--forces: {paths[0]} has the forces; leave the option out"])
+        raise SceneError([f"--forces: {paths[0]} contains forces already; leave the option out"])
     if unused := [name for name in POINT_OPTIONS if method.get(name) is not None]:
         raise SceneError([f"--{unused[0]}: only for observed points, and {paths[0]} has none; leave the option out"])
     rate, contacts = method.get("rate"), list(method.get("contact") or ())
     if rate is not None and not 0 < rate < np.inf:
         raise SceneError([f"--rate {rate:g}: take a number of frames per second, above 0"])
     if len(contacts) not in (0, 1, len(paths)):
-        raise SceneError([f"--contact: {len(contacts)} depths of {len(paths)} tables; give one, or one per table"])
+        raise SceneError([f"--contact: {len(contacts)} depths for {len(paths)} tables; give one, or one per table"])
     approach, tests = find_approach(scene), []
     for n, (path, key) in enumerate(zip(paths, contact_keys(len(paths)), strict=True)):
         test = read_machine_test(path, method.get("columns") or (), method.get("sheet"), method.get("block"))
@@ -197,8 +197,8 @@ def read_machine_problem(
             test = cut_window(test, *window)
         contact = contacts[n if len(contacts) > 1 else 0] if contacts else None
         loading = build_loading(test, scene, rate, contact, is_clamp=approach.is_clamp)
-        is_found = contact is None and not approach.is_clamp and key not in free
-        if is_found and (note := late_contact_note(loading, key)):
+        is_estimated = contact is None and not approach.is_clamp and key not in free
+        if is_estimated and (note := late_contact_note(loading, key)):
             loading = replace(loading, test=replace(loading.test, notes=(*loading.test.notes, note)))
         tests.append(loading)
     parameters = _make_parameters(scene, tests, free, bounds, approach.probe)
@@ -220,13 +220,13 @@ def read_machine_problem(
 def _make_parameters(
     scene: Scene, tests: Sequence[Loading], free: Sequence[str], bounds: Mapping[str, Bounds], probe: int
 ) -> tuple[Parameter, ...]:
-    """Build the parameters of the keys `free`, among them depths of contact; `probe`: index of the tool."""
+    """Build the parameters of the keys `free`, including depths of contact; `probe`: index of the tool."""
     contacts = contact_keys(len(tests))
     for key in free:
         if key.partition(".")[0] == "contact" and key not in contacts:
-            raise SceneError([f"--free {key}: there is no such table; take {' or '.join(contacts)}"])
+            raise SceneError([f"--free {key}: no such table; take {' or '.join(contacts)}"])
         if f"{key}.".startswith(f"probes.{probe}.path."):
-            raise SceneError([f"--free {key}: the path is that of the table; name contact, its depth of contact"])
+            raise SceneError([f"--free {key}: the table sets the path; free contact, the depth of contact"])
     of_scene = [key for key in free if key not in contacts]
     parameters = {}
     if of_scene or not free:
@@ -234,13 +234,13 @@ def _make_parameters(
         parameters = {parameter.key: parameter for parameter in make_parameters(scene, of_scene, limits)}
     for key, test in zip(contacts, tests, strict=True):
         if key in free:
-            # A depth of contact is in metres of the table; x is in units of the range in which the tool moves.
+            # Depths of contact are in metres, as in the table; x is in units of their range.
             low, high = first, last = float(test.depth[0]), float(test.depth.max())
             if key in bounds:
                 low, high = max(first, bounds[key][0]), min(last, bounds[key][1])
             if not (low <= test.contact <= high and low < high):
-                fault = f"the search begins at {test.contact:.4g} m, and the table's depths end at {last:.4g} m"
-                remedy = "take bounds around the start, or another start by --contact"
+                fault = f"the initial depth is {test.contact:.4g} m, and the greatest one of the table {last:.4g} m"
+                remedy = "take bounds around the initial depth, or another one by --contact"
                 raise SceneError([f"--bounds {key}: {fault}; {remedy}"])
             parameters[key] = Parameter(key, test.contact, low, high, high - low)
     return tuple(parameters[key] for key in free)

@@ -21,15 +21,15 @@ Array = NDArray[np.float64]
 # Largest residual of a good fit, as a share of the signal and in sigma.
 MAX_RESIDUAL_SHARE, MAX_RESIDUAL_SIGMAS = 0.1, 2.0
 
-# Largest cosine of opposed components, their smallest norm [sigma], and the smallest number of values.
+# Opposed components: largest cosine, smallest norm [sigma], and smallest number of values.
 MAX_COSINE, MIN_SIGMAS, MIN_COUNT = -0.9, 5.0, 3
 
 
 class ErrorCorrelation(NamedTuple):
-    """Correlation lengths of the errors of tracks; None for independent errors."""
+    """Correlation lengths of tracking errors; None for independent errors."""
 
-    correlation: float | None  # of two tracks [px]
-    drift: float | None  # of two times [s]
+    correlation: float | None  # length between tracks [px]
+    drift: float | None  # time within a track [s]
 
 
 class ObservationModel(ABC):
@@ -37,11 +37,11 @@ class ObservationModel(ABC):
 
     @abstractmethod
     def record(self, simulation: Simulation) -> Array:
-        """Return the record of the current frame, of any shape."""
+        """Return the record of the current frame, an array of a fixed shape."""
 
     @abstractmethod
     def predict(self, recorded: Array) -> Array:
-        """Return the values of the observation, from the records of all frames."""
+        """Return the values of the observation; `recorded`: records of all frames, stacked."""
 
     def motion(self, recorded: Array) -> Array:
         """Return the largest displacement of the observed points at each frame [m], shape (frames,)."""
@@ -55,11 +55,11 @@ class Observation(ABC):
     Attributes:
         noun: name of the values, for messages.
         unit: unit of the values and of sigma.
-        is_independent: whether the errors are independent, so that chi-square of these values alone may reject a model.
+        is_independent: whether errors are independent, so that chi-square of these values alone may reject a model.
         name: name of the file, for messages.
         time: times of the values [s].
         values: measured values [unit], NaN where not measured.
-        sigma: standard deviation of the errors [unit]: one number, an array of shape (known,), or None if estimated.
+        sigma: standard deviation of the errors [unit], a number or of shape (known,); None to estimate it.
     """
 
     noun: ClassVar[str]
@@ -77,7 +77,7 @@ class Observation(ABC):
         return np.isfinite(self.values)
 
     def with_sigma(self, sigma: Any) -> Self:
-        """Return the observation with another sigma, unless that is None; raise a SceneError unless it is positive."""
+        """Return the observation with a new sigma, or unchanged for None; raise a SceneError for an invalid sigma."""
         if sigma is None:
             return self
         array = np.asarray(sigma)
@@ -94,21 +94,21 @@ class Observation(ABC):
 
         Args:
             scene: scene of the run, with its mesh and camera.
-            frames: number of frames, from the first one.
+            frames: number of recorded frames.
         """
 
     @abstractmethod
     def signal(self, scene: Scene) -> float:
-        """Return the root mean square of the explained part of the values [unit]; 0 without any."""
+        """Return the root mean square of the values' motion or force, which the model explains [unit]."""
 
     @abstractmethod
     def fits_well(self, residuals: Array, deviation: float, signal: float) -> bool:
         """Return whether the residuals are small.
 
         Args:
-            residuals: predicted minus observed known values [unit], shape (known,).
-            deviation: standard deviation estimated from them [unit].
-            signal: root mean square of the explained part of the values [unit].
+            residuals: predicted minus observed values [unit], shape (known,).
+            deviation: standard deviation estimated from the residuals [unit].
+            signal: root mean square from `signal` [unit].
         """
 
     @abstractmethod
@@ -121,55 +121,55 @@ class Observation(ABC):
         """
 
     def faults(self, scene: Scene) -> Iterator[str]:
-        """Yield the faults that need no run: units, lost values."""
+        """Yield the faults found without a run, such as wrong units and sentinel values."""
         yield from ()
 
     def is_still(self, scene: Scene) -> bool:
-        """Return whether the values show no motion."""
+        """Return whether no significant motion was observed."""
         return False
 
     def faults_at_start(self, scene: Scene, predicted: Array, *, same_camera: bool) -> Iterator[str]:
-        """Yield the faults that a run of the scene shows: mirrored axes, another camera or origin.
+        """Yield the faults found with a run of the initial scene: mirrored axes, another camera or origin.
 
         Args:
-            scene: the scene with its initial values.
-            predicted: its predicted values, with the shape of `values`.
-            same_camera: whether the scene has the camera of the observation, which is False if the camera is fitted.
+            scene: the initial scene.
+            predicted: values predicted by the initial scene, with the shape of `values`.
+            same_camera: whether the camera is fixed, so that a displacement is a fault.
         """
         yield from ()
 
     def opposed(self, scene: Scene, *predictions: Array) -> Iterator[str]:
-        """Yield a message per component that has the opposite sign in all predictions.
+        """Yield a message for every component with the opposite sign in all predictions.
 
         Args:
-            scene: the scene with its initial values.
+            scene: the initial scene.
             predictions: predicted values, each with the shape of `values`.
         """
         yield from ()
 
     def unit_faults(self, *predictions: Array) -> Iterator[str]:
-        """Yield the unit that explains the ratio of the values to all predictions."""
+        """Yield a message if another unit explains the ratio of observed values to all predictions."""
         yield from ()
 
     def pattern(self, residuals: Array, signal: float, correlation: ErrorCorrelation) -> str | None:
-        """Return the reason for rejecting a model by a pattern of its residuals, or None.
+        """Return the reason to reject the model for a pattern in the residuals, or None.
 
         Args:
             residuals: predicted minus observed values, with the shape of `values`.
-            signal: root mean square of the explained part of the values [unit].
-            correlation: given correlation of the errors.
+            signal: root mean square from `signal` [unit].
+            correlation: given correlation lengths of the errors.
         """
         return None
 
     def factor_note(self, predicted: Array) -> str:
-        """Describe a common factor of the values and the prediction, or return an empty string."""
+        """Return a clause about a common factor of values and prediction, or an empty string."""
         return ""
 
     def correlated(self, rows: Array, correlation: ErrorCorrelation) -> tuple[Array, float]:
-        """Return R^T K R, shape (n, n), and tr(K^2), with K the correlation of the errors; K = 1 by default.
+        """Return R^T K R, shape (n, n), and tr(K^2), for the correlation matrix K of the errors, by default 1.
 
         Args:
-            rows: R, a row per known value, shape (known, n).
+            rows: R, shape (known, n).
             correlation: correlation lengths that define K.
         """
         return rows.T @ rows, float(len(rows))
@@ -179,14 +179,14 @@ class Observation(ABC):
 
         Args:
             predicted: values predicted by the solution, with the shape of `values`.
-            signal: root mean square of the explained part of the values [unit].
-            correlation: given correlation of the errors.
+            signal: root mean square from `signal` [unit].
+            correlation: given correlation lengths of the errors.
         """
         yield from ()
 
 
 def time_in_frames(scene: Scene, time: Array) -> Array:
-    """Return times as frame numbers, rounded to six decimals, so that times of frames become integers.
+    """Return times in frames, rounded to six decimals, so that times of frames become integers.
 
     Args:
         scene: scene with the frame rate.
@@ -196,7 +196,7 @@ def time_in_frames(scene: Scene, time: Array) -> Array:
 
 
 def time_weights(scene: Scene, time: Array, frames: int) -> Any:
-    """Return the weights of linear interpolation between frames, sparse, shape (T, frames).
+    """Return the sparse matrix of linear interpolation between frames, shape (T, frames).
 
     Args:
         scene: scene with the frame rate.
@@ -212,7 +212,7 @@ def time_weights(scene: Scene, time: Array, frames: int) -> Any:
 
 
 def opposed_axes(observed: Array, predictions: Sequence[Array], sigma: Any) -> list[int]:
-    """Return the components (last axis) of a significant size that have the opposite sign in all predictions.
+    """Return the components (indices of the last axis) that are significant, with the opposite sign in all predictions.
 
     Args:
         observed: observed values, shape (..., components), NaN where not observed.
@@ -226,7 +226,7 @@ def opposed_axes(observed: Array, predictions: Sequence[Array], sigma: Any) -> l
         first, second = (np.where(known, array, 0.0).reshape(-1, size) for array in (observed, predicted))
         lengths = np.linalg.norm(first, axis=0), np.linalg.norm(second, axis=0)
         counts = known.reshape(-1, size).sum(axis=0)
-        # Without sigma more values are needed.
+        # Without sigma, significance needs more values.
         is_opposed &= counts >= (12 if sigma is None else MIN_COUNT)
         is_opposed &= lengths[0] > MIN_SIGMAS * (sigma or 0.0) * np.sqrt(counts)
         for length in lengths:

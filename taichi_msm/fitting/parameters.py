@@ -20,7 +20,7 @@ from taichi_msm.errors import MAX_WORKERS, ArgumentError, Key, SceneError, did_y
 from taichi_msm.load.scene_file import parse_key
 from taichi_msm.scene.scene import Scene
 
-# Sections with fittable numbers, and keys in them that are not: options, array sizes, and keys without effect.
+# Sections with fittable numbers, and keys that are not fittable: options, array sizes, and keys without effect.
 SECTIONS = ("tissue", "springs", "damping", "sheet", "probes", "render.camera", "render.cameras")
 FIXED_KEYS = ("tolerance", "grip", "shaft", "points")
 
@@ -93,7 +93,7 @@ class Parameter:
         return deviation * (abs(self.value(x)) if self.is_log else self.scale)
 
     def share(self, x: float, deviation: float) -> float:
-        """Return the standard deviation as a share of the value, or of the range of a place or time.
+        """Return the standard deviation as a share of the value, or of the range for a coordinate or time.
 
         Args:
             x: coordinate.
@@ -114,7 +114,7 @@ def make_parameters(scene: Scene, free: Sequence[str], bounds: Mapping[str, Boun
         bounds: smallest and largest values by key.
 
     Raises:
-        SceneError: when a key or its bounds are invalid; it has all faults.
+        SceneError: when keys or bounds are invalid, with all faults.
     """
     data, faults, parameters = as_data(scene), [], []
     if not free:
@@ -136,7 +136,7 @@ def _parameter(scene: Scene, data: dict[str, Any], key: str, low: float, high: f
     path, option = parse_key(key), f"--free {key}"
     if path and path[-1] in ("map", "foundation_map"):
         example = f"{scene.kind}.{path[-1]}.range.1"
-        raise SceneError([f"{option}: of maps only tissue.map is fitted; name numbers, such as {example}"])
+        raise SceneError([f"{option}: the only fitted map is tissue.map; name numbers, such as {example}"])
     value = _look_up(option, data, path)
     if not _is_fittable(path, value):
         description = f"{value!r}"
@@ -149,7 +149,7 @@ def _parameter(scene: Scene, data: dict[str, Any], key: str, low: float, high: f
     if not low < high:
         raise SceneError([f"{interval}: give the smaller one first, then a larger one"])
     if not low <= value <= high:
-        raise SceneError([f"{interval}: {value:g}, where it starts, is outside; --set {key}=..."])
+        raise SceneError([f"{interval}: the initial value {value:g} is outside; --set {key}=..."])
     is_bounded, is_coordinate = math.isfinite(high - low), _is_coordinate(path)
     if value and not is_coordinate:
         scale = 0.0
@@ -157,7 +157,7 @@ def _parameter(scene: Scene, data: dict[str, Any], key: str, low: float, high: f
         scale = high - low if is_bounded else _default_range(scene, path)
     else:
         remedy = f"add --bounds {key}=LOW,HIGH, or --set {key}=..."
-        raise SceneError([f"{option}: starts at 0, so its size is open; {remedy}"])
+        raise SceneError([f"{option}: starts at 0, so its magnitude is unknown; {remedy}"])
     return Parameter(key, value, low, high, scale)
 
 
@@ -222,7 +222,7 @@ def with_values(data: dict[str, Any], parameters: Sequence[Parameter], values: M
     """Return a copy of a scene's data with other values of parameters.
 
     Args:
-        data: data of a scene, as of `as_data`.
+        data: data of a scene, from `as_data`.
         parameters: the parameters to be replaced.
         values: their values by key.
     """

@@ -1,8 +1,7 @@
 """Observed points: their positions, or their pixels in the scene's main camera, over time.
 
-A point on the drawn surface is a weighted mean of four mass points, moves in a straight line between frames, and is
-projected by the camera. The first two maps are linear, with their transposes as adjoints; the derivative of the
-projection is a central difference.
+Predictions interpolate the drawn surface between four mass points, interpolate linearly between frames, and project by
+the camera. The adjoints of the interpolations are their transposes; the projection has central differences.
 """
 
 from __future__ import annotations
@@ -23,20 +22,19 @@ from taichi_msm.render.camera import view_at
 from taichi_msm.runs.simulation import Simulation
 from taichi_msm.scene.scene import Scene
 
-# Largest ratio of the observed extent to that at rest, or its inverse, with correct units.
+# Largest ratio of the observed extent to the extent at rest, or of their inverse, in correct units.
 MAX_EXTENT_RATIO = 30.0
 
-# Smallest root mean square of the motion of a point that is significant [sigma].
+# Smallest significant root mean square of the motion of a point [sigma].
 MIN_MOTION_SIGMAS = 1.5
 
-# Motion below this share of the coordinates is rounding.
+# Largest rounding error, as a share of the coordinates.
 ROUNDING_SHARE = 1e-9
 
-# Largest offset of the first observed points from rest, with the correct camera and origin: in pixels, or as a share
-# of the sheet.
+# Largest offset of the first observations from rest with a correct camera [px], or origin [share of the sheet].
 MAX_OFFSET_PX, MAX_OFFSET_SHARE = 3.0, 0.02
 
-# Smallest correlation of residuals for a warning.
+# Smallest correlation of residuals with a warning.
 MIN_ERROR_CORRELATION = 0.3
 
 
@@ -44,9 +42,9 @@ class PointModel(ObservationModel):
     """Map from the mass points of a scene to observed points, and its adjoint.
 
     Args:
-        scene: the scene, with its camera.
-        observed: the observed points and times.
-        frames: number of frames, from the first one.
+        scene: scene with mesh and camera.
+        observed: observed points and times.
+        frames: number of recorded frames.
     """
 
     def __init__(self, scene: Scene, observed: PointObservation, frames: int) -> None:
@@ -63,20 +61,20 @@ class PointModel(ObservationModel):
         return self.on_sheet(simulation.positions()[None])[0]
 
     def predict(self, recorded: Array) -> Array:
-        """Return the observations of points, shape (frames, N, 3), as `observe` does."""
+        """Return the values of points in all frames, shape (frames, N, 3), as `observe` does."""
         return self.observe(self.interpolate(recorded))
 
     def motion(self, recorded: Array) -> Array:
-        """Return the largest displacement of points, shape (frames, N, 3), at each frame [m], shape (frames,)."""
+        """Return the largest displacement in every frame [m], shape (frames,), of points, shape (frames, N, 3)."""
         moved = recorded - self._observed.rest_positions(self.scene)
         return np.asarray(np.linalg.norm(moved, axis=2).max(axis=1))
 
     def on_sheet(self, position: Array) -> Array:
-        """Interpolate positions [m], shape (frames, rows, cols, 3), at the observed points, shape (frames, N, 3)."""
+        """Interpolate positions [m], shape (frames, rows, cols, 3), in space; returns shape (frames, N, 3)."""
         return np.array([self._surface @ frame.reshape(-1, 3) for frame in position])
 
     def interpolate(self, at_frames: Array) -> Array:
-        """Interpolate points, shape (frames, N, 3), at the observed times, shape (N, T, 3)."""
+        """Interpolate points, shape (frames, N, 3), in time; returns shape (N, T, 3)."""
         at_times = self._time_weights @ at_frames.reshape(len(at_frames), -1)
         return np.asarray(at_times.reshape(-1, *at_frames.shape[1:]).swapaxes(0, 1))
 
@@ -85,18 +83,15 @@ class PointModel(ObservationModel):
         return self.interpolate(self.on_sheet(position))
 
     def observe(self, points: Array) -> Array:
-        """Convert points [m], shape (N, T, 3), to observations, shape (N, T, 3 or 2); NaN behind the camera."""
+        """Convert points [m], shape (N, T, 3), to values, shape (N, T, 3 or 2), NaN behind the camera."""
         return self._observed.observe(self.scene, points)
 
     def backward(self, points: Array, gradient: Array) -> Array:
-        """Return the gradient of a loss by the positions of every frame.
+        """Return the gradient of a loss by the positions of all frames, shape (frames, rows, cols, 3).
 
         Args:
-            points: observed points [m], shape (N, T, 3).
-            gradient: gradient by the observations, shape (N, T, 3 or 2).
-
-        Returns:
-            Gradient by the positions, shape (frames, rows, cols, 3).
+            points: predicted points [m], shape (N, T, 3).
+            gradient: gradient by the values, shape (N, T, 3 or 2).
         """
         gradient = self._observed.backward(self.scene, points, gradient)
         at_frames = self._time_weights.T @ gradient.swapaxes(0, 1).reshape(gradient.shape[1], -1)
@@ -105,13 +100,13 @@ class PointModel(ObservationModel):
 
 
 class Conventions(NamedTuple):
-    """Camera or origin of observed points, for messages about points that are displaced at rest.
+    """Conventions of camera or origin, for messages about displaced points.
 
     Attributes:
-        tolerance: largest offset with the correct camera and origin [m] or [px].
-        place: clause about the expected place of points at rest.
-        remedy: remedy for another camera or origin.
-        mirror_remedies: remedies for a mirrored x and y.
+        tolerance: largest offset of correct points at rest [m] or [px].
+        place: clause on the expected place of points at rest.
+        remedy: remedy for a wrong camera or origin.
+        mirror_remedies: remedies for mirrored x, and for mirrored y.
     """
 
     tolerance: float
@@ -122,11 +117,11 @@ class Conventions(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class PointObservation(Observation):
-    """Points over time; values of shape (N, T, 3 or 2), times of shape (T,).
+    """Tracks of N points at T times; values of shape (N, T, 3 or 2), times of shape (T,).
 
     Attributes:
-        kind: name of the array of values.
-        correlation_remedy: option for correlated errors of neighbouring points; empty if there is none.
+        kind: name of the array of values in a file.
+        correlation_remedy: remedy for correlated errors of neighbouring points, or an empty string.
         coordinates: across and down as fractions of the sheet, shape (N, 2).
     """
 
@@ -139,12 +134,12 @@ class PointObservation(Observation):
 
     @property
     def is_observed(self) -> NDArray[np.bool_]:
-        """Mask of the observed points over time, shape (N, T)."""
+        """Mask of the observed points and times, shape (N, T)."""
         return self.known[..., 0]
 
     @property
     def subject(self) -> str:
-        """Name of the values, in messages."""
+        """Subject of messages: file and array."""
         return f"{self.name}: {self.kind}"
 
     def build_model(self, scene: Scene, frames: int) -> PointModel:
@@ -152,7 +147,7 @@ class PointObservation(Observation):
 
     @abstractmethod
     def observe(self, scene: Scene, points: Array) -> Array:
-        """Return the values of points, shape (N, T, 3 or 2); NaN where they are not visible.
+        """Return the values of points, shape (N, T, 3 or 2), NaN where a point has no pixel.
 
         Args:
             scene: scene with the camera.
@@ -161,7 +156,7 @@ class PointObservation(Observation):
 
     @abstractmethod
     def backward(self, scene: Scene, points: Array, gradient: Array) -> Array:
-        """Return the gradient of a loss by points, shape (N, T, 3).
+        """Return the gradient of a loss by the points, shape (N, T, 3).
 
         Args:
             scene: scene with the camera.
@@ -171,7 +166,7 @@ class PointObservation(Observation):
 
     @abstractmethod
     def conventions(self, scene: Scene) -> Conventions:
-        """Return the conventions of the values."""
+        """Return the conventions of camera or origin."""
 
     def rest_positions(self, scene: Scene) -> Array:
         """Return the rest positions of the points [m], shape (N, 3)."""
@@ -180,7 +175,7 @@ class PointObservation(Observation):
         return np.stack([(across - 0.5) * width, (0.5 - down) * height, np.zeros_like(across)], axis=1)
 
     def at_rest(self, scene: Scene) -> Array:
-        """Return the values of a sheet at rest."""
+        """Return the values of the sheet at rest, shape (N, T, 3 or 2)."""
         return self.observe(scene, np.repeat(self.rest_positions(scene)[:, None], len(self.time), axis=1))
 
     def signal(self, scene: Scene) -> float:
@@ -197,7 +192,7 @@ class PointObservation(Observation):
         return {"residual": float(np.sqrt(np.mean(residuals**2))), "sigma": sigma, "unit": self.unit}
 
     def faults(self, scene: Scene) -> Iterator[str]:
-        """Yield sentinel values of lost points."""
+        """Yield a message about a sentinel value of lost points."""
         rest = self.at_rest(scene)
         is_sentinel = (self.values == self.values[..., :1]).all(axis=2)
         is_sentinel &= ~(np.linalg.norm(rest - self.values[..., :1], axis=-1) < self.conventions(scene).tolerance)
@@ -208,7 +203,7 @@ class PointObservation(Observation):
                 return
 
     def is_still(self, scene: Scene) -> bool:
-        """Return whether the observed motion is within its errors."""
+        """Return whether the observed motion is within the errors."""
         if self.sigma is None:
             return self.signal(scene) <= ROUNDING_SHARE * float(np.nanmax(np.abs(self.values)))
         chi_square = float(np.nansum((self._motion(scene) / self.sigma) ** 2))
@@ -219,22 +214,22 @@ class PointObservation(Observation):
 
     def faults_at_start(self, scene: Scene, predicted: Array, *, same_camera: bool) -> Iterator[str]:
         if invisible := int((self.known & ~np.isfinite(predicted)).any(axis=(1, 2)).sum()):
-            fault = "are behind the eye of the scene's camera, or beyond its lens, where the search begins"
-            remedy = "give the scene the camera that saw them, or NaN in their place"
+            fault = "are behind the scene's camera, or beyond its lens, at the initial values"
+            remedy = "give the scene the camera of the recording, or NaN in their place"
             yield f"{self.subject}: {invisible} of the observed points {fault}; {remedy}"
         elif same_camera and (axes := self._mirrored_axes(scene)):
             names = " and ".join("xy"[axis] for axis in axes)
             remedy = " and ".join(self.conventions(scene).mirror_remedies[axis] for axis in axes)
-            yield f"{self.subject}: {names} of the points at rest has the other sign in the scene; take {remedy}"
+            yield f"{self.subject}: {names} of the points at rest has the opposite sign in the scene; take {remedy}"
         elif same_camera:
-            yield from self._misplaced(scene, predicted)
+            yield from self._offset_faults(scene, predicted)
 
     def opposed(self, scene: Scene, *predictions: Array) -> Iterator[str]:
         rest = self.at_rest(scene)
         moved = [prediction - rest for prediction in predictions]
         for axis in observation.opposed_axes(self.values - rest, moved, self.sigma):
-            fault = f"{'xyz'[axis]} changes against the scene's; is its sign, or that of a tool's force or path, wrong?"
-            yield f"{self.subject}: {fault} change the sign of either"
+            fault = f"the motion in {'xyz'[axis]} is opposite to the scene's; is its sign wrong, or that of the tool?"
+            yield f"{self.subject}: {fault} change the sign of {'xyz'[axis]}, or of the force or path"
 
     def pattern(self, residuals: Array, signal: float, correlation: ErrorCorrelation) -> str | None:
         return rejection.by_pattern(
@@ -244,7 +239,7 @@ class PointObservation(Observation):
     def correlated(self, rows: Array, correlation: ErrorCorrelation) -> tuple[Array, float]:
         from scipy.spatial.distance import cdist
 
-        # Distances are those of mean observed positions; tracks without observations are left out.
+        # Distances are between mean pixels; tracks without observations are left out.
         is_tracked: NDArray[np.bool_] = np.any(self.is_observed, axis=1)
         space, time = np.eye(int(is_tracked.sum())), np.eye(len(self.time))
         if correlation.correlation is not None:
@@ -264,27 +259,27 @@ class PointObservation(Observation):
         residuals = predicted - self.values
         if np.sqrt(np.nanmean(residuals**2)) < max(1e-6 * signal, 0.1 * (self.sigma or 0.0)):
             if self.sigma is None:
-                yield "the residual is next to 0, and so are the intervals; give the standard deviation by --sigma"
+                yield "the residual is almost 0, and so are the intervals; give the standard deviation by --sigma"
             return
-        in_space, in_time = _residual_correlations(residuals, self.coordinates)
-        if in_space > MIN_ERROR_CORRELATION and correlation.correlation is None:
+        space_correlation, time_correlation = _residual_correlations(residuals, self.coordinates)
+        if space_correlation > MIN_ERROR_CORRELATION and correlation.correlation is None:
             remedy = f"; {self.correlation_remedy}" if self.correlation_remedy else ""
-            fault = f"the residuals of neighbouring points are correlated (by {in_space:.2f})"
+            fault = f"the residuals of neighbouring points are correlated (by {space_correlation:.2f})"
             yield f"{fault}, so that the intervals are too narrow{remedy}"
-        elif in_time > MIN_ERROR_CORRELATION and correlation.drift is None:
-            fault = f"the residuals of a point are correlated in time (by {in_time:.2f})"
+        elif time_correlation > MIN_ERROR_CORRELATION and correlation.drift is None:
+            fault = f"the residuals of a point are correlated in time (by {time_correlation:.2f})"
             yield f"{fault}, so that the intervals are too narrow; give --drift SECONDS"
 
     def _motion(self, scene: Scene) -> Array:
-        """Return observed minus mean positions, or minus rest positions if every point was observed once."""
+        """Return the values minus their mean over time, or minus rest if every point was observed only once."""
         known = self.is_observed.any(axis=1)
         values, is_repeated = self.values[known], self.is_observed.sum(axis=1).max() > 1
         motion = values - (np.nanmean(values, axis=1, keepdims=True) if is_repeated else self.at_rest(scene)[known])
-        # Rest positions may be behind the camera.
+        # Points behind the camera at rest have no values to subtract.
         return motion[np.isfinite(motion).any(axis=(1, 2))]
 
     def _mirrored_axes(self, scene: Scene) -> list[int]:
-        """Return the axes on which the points have the opposite sign of those at rest."""
+        """Return the axes that are mirrored between the observed points and those at rest."""
         count = self.is_observed.sum(axis=1)
         expected, observed = (
             np.where(self.known, each, 0.0).sum(axis=1)[count > 0, :2] / count[count > 0, None]
@@ -294,15 +289,15 @@ class PointObservation(Observation):
             return []
         return observation.opposed_axes(observed - observed.mean(axis=0), [expected - expected.mean(axis=0)], None)
 
-    def _misplaced(self, scene: Scene, predicted: Array) -> Iterator[str]:
-        """Compare the first observed points with their rest positions: the camera or origin may differ."""
+    def _offset_faults(self, scene: Scene, predicted: Array) -> Iterator[str]:
+        """Yield a message if the first observations are displaced from rest, as with another camera or origin."""
         tolerance, place, remedy, _ = self.conventions(scene)
         rest, start = self.at_rest(scene), int(np.argmax(self.is_observed.any(axis=0)))
         offsets = np.linalg.norm((self.values - rest)[:, start], axis=1)[self.is_observed[:, start]]
         offset = float(np.median(np.where(np.isfinite(offsets), offsets, math.inf)))
         motion = float(np.nanmax(np.linalg.norm(predicted - rest, axis=2)))
         if offset > max(tolerance, 5 * (self.sigma or 0.0), 3.0 * max(motion, self.signal(scene))):
-            fault = f"half of the points are {offset:.3g} {self.unit} or more from where {place}"
+            fault = f"half of the points are at least {offset:.3g} {self.unit} from where {place}"
             yield f"{self.subject}: {fault}; {remedy}"
 
 
@@ -330,7 +325,7 @@ class Positions(PointObservation):
         )
 
     def faults(self, scene: Scene) -> Iterator[str]:
-        """Compare the extent of the observed points with that at rest; yield sentinel values of lost points."""
+        """Yield messages about an extent in other units, and about sentinel values of lost points."""
         is_observed = self.is_observed.any(axis=1)
         rest = self.rest_positions(scene)[is_observed]
         if len(rest) > 1:
@@ -339,7 +334,9 @@ class Positions(PointObservation):
                 float(np.linalg.norm(points - points.mean(axis=0), axis=1).max()) for points in (centres, rest[:, :2])
             )
             if rest_extent > 0 and extent > 0 and not 1 / MAX_EXTENT_RATIO < extent / rest_extent < MAX_EXTENT_RATIO:
-                fault = f"the points are {extent:.3g} m from their middle, and {rest_extent:.3g} m at rest; give metres"
+                fault = (
+                    f"the points extend {extent:.3g} m from their middle, but {rest_extent:.3g} m at rest; give metres"
+                )
                 unit = {3: ": are they in mm? divide them by 1000", 2: ": are they in cm? divide them by 100"}
                 yield f"{self.subject}: {fault}{unit.get(round(math.log10(extent / rest_extent)), '')}"
         yield from super().faults(scene)
@@ -349,8 +346,7 @@ class Positions(PointObservation):
 class Pixels(PointObservation):
     """Pixels of points [px], from the upper left corner of the picture; values of shape (N, T, 2).
 
-    Points behind the eye of the camera, or beyond its lens, have no pixel. The gradient is that of central differences
-    of the projection.
+    Points behind the camera, or beyond its lens, have no pixel. The projection has central differences.
     """
 
     kind: ClassVar[str] = "pixel"
@@ -374,13 +370,13 @@ class Pixels(PointObservation):
         width, height = scene.render.size
         return Conventions(
             MAX_OFFSET_PX,
-            f"the scene's camera sees them at rest in its {width} x {height} px",
+            f"the scene's camera shows them at rest in its {width} x {height} px",
             "give the scene that camera and size, and count from the picture's upper left corner, right and down",
             (f"{width} - x, counted from the left", f"{height} - y, counted from above"),
         )
 
     def faults(self, scene: Scene) -> Iterator[str]:
-        """Yield sentinel values of lost points, or fractions of the frame instead of pixels."""
+        """Yield messages about sentinel values of lost points, or about fractions of the frame instead of pixels."""
         sentinels = list(super().faults(scene))
         yield from sentinels
         largest, rest = np.nanmax(np.abs(self.values)), self.at_rest(scene)
@@ -389,9 +385,9 @@ class Pixels(PointObservation):
             fault = "are they fractions of the frame? multiply them by its width and height"
             yield f"{self.subject}: up to {largest:.3g}; {fault}, {width} and {height} in the scene"
 
-    def _misplaced(self, scene: Scene, predicted: Array) -> Iterator[str]:
-        """Yield a wrong camera, or a common half-pixel offset of all points whose predicted motion is below 0.02 px."""
-        yield from super()._misplaced(scene, predicted)
+    def _offset_faults(self, scene: Scene, predicted: Array) -> Iterator[str]:
+        """Yield a message about another camera, or about a half-pixel offset of points at rest, within 0.02 px."""
+        yield from super()._offset_faults(scene, predicted)
         rest = self.at_rest(scene)
         is_at_rest = self.is_observed & (np.linalg.norm(predicted - rest, axis=2) < 0.02)
         count = is_at_rest.sum(axis=1)
@@ -403,9 +399,9 @@ class Pixels(PointObservation):
         mean, error = offsets.mean(axis=0), np.maximum(offsets.std(axis=0, ddof=1) / np.sqrt(len(offsets)), sigma_error)
         halves = np.where(np.abs(mean) < 0.25, 0.0, 0.5 * np.sign(mean))
         distance = np.abs(np.stack([mean, np.median(offsets, axis=0)]) - halves).max(axis=0)
-        # The mean offset is within 3 standard errors of a half or 0, precise, and significant [px].
-        is_near = (distance <= 3.0 * error + 0.02) & (error < 0.1)
-        if is_near.all() and ((halves != 0) & (np.abs(mean) > 5.0 * error)).any():
+        # A half-pixel offset: the mean is within 3 standard errors of 0 or a half, precise, and significant [px].
+        is_half = (distance <= 3.0 * error + 0.02) & (error < 0.1)
+        if is_half.all() and ((halves != 0) & (np.abs(mean) > 5.0 * error)).any():
             shown = " and ".join(f"{offset:+.2g} px in {axis}" for offset, axis in zip(mean, "xy", strict=True))
             side, remedy = (0, "add") if halves.min() < 0 else (1, "subtract")
             question = f"is the centre of their first pixel at {side}? {remedy} 0.5, as it is at 0.5 here"
@@ -413,7 +409,7 @@ class Pixels(PointObservation):
 
 
 def _residual_correlations(residuals: Array, coordinates: Array) -> tuple[float, float]:
-    """Return the correlations of residuals, shape (N, T, numbers), of nearest neighbours and of successive times."""
+    """Return the correlations of residuals, shape (N, T, 3 or 2), between neighbours and between successive times."""
     from scipy.spatial import KDTree
 
     def correlation(first: Array, second: Array) -> float:
@@ -421,9 +417,9 @@ def _residual_correlations(residuals: Array, coordinates: Array) -> tuple[float,
         is_known = np.isfinite(product)
         return 2 * float(product[is_known].sum()) / max(float(square[is_known].sum()), 1e-300)
 
-    in_space = 0.0
+    space_correlation = 0.0
     if len(residuals) > 1:
         # The nearest point is the point itself, the second its neighbour.
         neighbour = KDTree(coordinates).query(coordinates, 2)[1][:, 1]
-        in_space = correlation(residuals, residuals[neighbour])
-    return in_space, correlation(residuals[:, 1:], residuals[:, :-1])
+        space_correlation = correlation(residuals, residuals[neighbour])
+    return space_correlation, correlation(residuals[:, 1:], residuals[:, :-1])

@@ -1,6 +1,6 @@
-"""Forward model of a fit: predicted observations and forces, in this process or in a pool.
+"""Forward model of a fit: predictions of observations, in this process or in a pool.
 
-All runs are in f64, with one compiled kernel per process.
+Runs are in f64, and every process compiles its kernels once.
 """
 
 from __future__ import annotations
@@ -230,12 +230,12 @@ class ForwardModel:
 def difference_step(scene: Scene) -> float:
     """Return the step of finite differences, in units of x.
 
-    It is larger for equilibria, which are solved to about 1e-6, and for contact, which changes in small jumps.
+    Equilibria, solved to about 1e-6, and contacts, which change in jumps, need larger steps.
     """
     return 1e-2 if scene.time.at_rest or any(probe.moved for probe in scene.probes) else 1e-5
 
 
-# Forward model of the last fit in this process, by its token.
+# Forward model of the last fit in this process by token; at most one entry.
 _cached_models: dict[str, ForwardModel] = {}
 
 
@@ -354,7 +354,7 @@ class Runs:
         if self._workers is not None:
             return self._workers
         parameters = len(self.problem.parameters)
-        # A pool, whose start takes seconds, pays off if eight runs per parameter take longer than eight seconds.
+        # A pool starts within seconds; it pays off if eight runs per parameter take more than eight seconds.
         if 8 * parameters * self._seconds < 8.0:
             return 1
         process_bytes = PROCESS_BYTES + cost.estimate_budget(check_scene(self.problem.scene)).memory_bytes

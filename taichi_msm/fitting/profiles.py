@@ -1,8 +1,8 @@
 """Profile likelihood of the parameters of a least-squares solution.
 
-A parameter is fixed, and the others are optimised within their bounds by Gauss-Newton steps with the Jacobian of the
-solution, a run per step. The interval ends where the cost has risen by t^2 f / 2, with Student's t, times the widening
-by correlated errors.
+A parameter is fixed, and the others are optimised within their bounds by Gauss-Newton steps, a run each, with the
+Jacobian of the solution. The interval ends where sqrt(2 rise of the cost / f) is Student's t times the widening by
+correlated errors.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ class ProfilePoint(NamedTuple):
 
     Attributes:
         x: coordinate of the parameter.
-        deviations: signed root of twice the rise of the cost over f; infinite where runs fail.
+        deviations: signed sqrt(2 rise of the cost / f) / widening; infinite where runs fail.
     """
 
     x: float
@@ -92,13 +92,13 @@ class Profiler:
         return Profile(sorted(point for point in points if math.isfinite(point.deviations)), ends[0], ends[1])
 
     def _side(self, n: int, sign: int) -> Side:
-        """Search for the end of the interval on one side; yields x to be predicted, and returns the points."""
+        """Find the end of the interval on one side; yield x to predict, and return the points."""
         x, root, quantile = self._solution.x, self._uncertainties.root, self._uncertainties.quantile
         variance = float(root[n] @ root[n])
         direction = root @ root[n] / variance
         limit = float((self._high if sign > 0 else self._low)[n] - x[n]) * sign
         points: list[ProfilePoint] = []
-        # Bracket of the end: distances, and the rises there, which are nearly proportional.
+        # Bracket of the end: pairs of distance and rise, which are nearly proportional.
         inner, outer = (0.0, 0.0), (math.inf, math.inf)
         distance = min(quantile * math.sqrt(variance), limit)
         while distance > 0 and len(points) < 8:

@@ -1,9 +1,9 @@
 """Rejection of a model by an improbable chi-square, or by correlated residuals.
 
-Products of independent errors, of successive times or of neighbouring points, have a mean of 0 and are uncorrelated,
-even if they share a point; Student's t tests their mean. Residuals are clipped, to limit the weight of tracks with
-jumps. As tracks may drift, products of neighbours are summed over time; if a correlation of neighbours is given,
-products of successive times are summed over the points.
+Residuals of successive times, or of neighbouring points, are multiplied. For independent errors the products have a
+mean of 0 and are uncorrelated, even if two products share a point; Student's t tests this mean. Clipped residuals limit
+the weight of jumps. Drift of tracks is allowed for by sums of the products of neighbours over time; a given correlation
+of neighbours by sums of the products of successive times over points.
 """
 
 from __future__ import annotations
@@ -43,8 +43,8 @@ def by_pattern(
     Args:
         residuals: predicted minus observed values [m] or [px], shape (N, T, 3 or 2), NaN where not observed.
         time: times of the observations [s], shape (T,).
-        coordinates: of the points on the sheet, shape (N, 2).
-        motion: root mean square of the motion [m] or [px].
+        coordinates: coordinates of the points on the sheet, shape (N, 2).
+        motion: root mean square of the observed motion [m] or [px].
         error_correlation: given correlation lengths of the errors.
         remedy: remedy for correlated errors of neighbouring points, for the reason.
     """
@@ -78,7 +78,7 @@ def _neighbours(coordinates: Array) -> tuple[NDArray[np.intp], NDArray[np.intp]]
 
 
 def _has_mean(products: Array, min_count: int) -> bool:
-    """Return whether the products have a significantly positive mean."""
+    """Return whether the mean of the products is significantly positive; False for fewer than `min_count`."""
     from scipy.stats import t
 
     products = products[products != 0]

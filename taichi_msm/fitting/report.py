@@ -41,7 +41,7 @@ def publication(directory: Path) -> Publication:
 
 
 def write_report(result: FitResult, published: Publication) -> None:
-    """Write and publish the files of a fit; without matplotlib fit.png is left out, with a note in the result.
+    """Write and publish the files of a fit; without matplotlib, skip fit.png and add a note to the result.
 
     Args:
         result: result of the fit.
@@ -54,7 +54,7 @@ def write_report(result: FitResult, published: Publication) -> None:
         write_new_file(folder / name, _scene_text(result, scene, folder, names).encode())
     if result.map is not None:
         _write_png(result.map.grey, folder / MAP)
-        # White: unknown, or with an error above 100 %.
+        # White cells are unknown, or have an error of at least 100 %.
         _write_png(sixteen_bits(np.nan_to_num(result.map.errors, nan=1.0).clip(0, 1)), folder / ERRORS)
     try:
         from taichi_msm.fitting.plots import plot
@@ -78,7 +78,7 @@ def _write_png(grey: NDArray[np.uint16], path: Path) -> None:
 def _scene_text(result: FitResult, scene: Scene, folder: Path, names: dict[str, str]) -> str:
     """Format a fitted scene, and copy its pictures to the folder; `names`: names of the copies by path."""
 
-    def copied(path: str) -> str:
+    def copy(path: str) -> str:
         if path not in names:
             name, number = Path(path).name, 1
             while f"{PICTURES}/{name}" in names.values():
@@ -90,9 +90,9 @@ def _scene_text(result: FitResult, scene: Scene, folder: Path, names: dict[str, 
         return names[path]
 
     if result.map is not None and scene.tissue is not None:
-        # The fitted map is written elsewhere; another picture may have its name.
+        # The fitted map is written by `write_report`, and not copied; another picture may have its name.
         scene = scene.model_copy(update={"tissue": scene.tissue.model_copy(update={"map": None})})
-    data = scene.with_pictures(copied).model_dump(mode="json", exclude_none=True)
+    data = scene.with_pictures(copy).model_dump(mode="json", exclude_none=True)
     if result.map is not None:
         data["tissue"]["map"] = {"image": MAP, "range": list(result.map.range)}
     text = yaml.safe_dump(data, sort_keys=False, default_flow_style=None, width=120, allow_unicode=True)

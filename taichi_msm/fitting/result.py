@@ -26,9 +26,9 @@ class Estimate(NamedTuple):
     Attributes:
         value: best value.
         standard_error: standard error of the value.
-        interval: ends of the 95 % confidence interval, each None beyond the bounds.
+        interval: ends of the 95 % confidence interval; None for an end beyond the bounds.
         start: initial value.
-        identifiable: whether the standard error is at most the value, or the range of a place or time.
+        identifiable: whether the standard error is at most the value, or the range of a coordinate or time.
         mesh_error: conservative estimate of the discretisation error of the value, or None if unknown.
     """
 
@@ -41,7 +41,7 @@ class Estimate(NamedTuple):
 
 
 def sixteen_bits(shares: Array) -> NDArray[np.uint16]:
-    """Convert shares, 0 to 1, to 16-bit grey."""
+    """Convert values from 0 to 1 to 16-bit grey."""
     return np.asarray((65535 * shares).round(), np.uint16)
 
 
@@ -117,9 +117,9 @@ class FitResult:
         sigma: standard deviation of the values [m] or [px], given or estimated, or None without points.
         unit: unit of residual and sigma, m or px.
         chi_square: sum of (predicted - observed)^2 / sigma^2, or None without a given sigma.
-        degrees_of_freedom: number of observations minus that of parameters; for a map, the number of observations.
+        degrees_of_freedom: number of observed numbers, minus the number of parameters except for a map.
         identifiable: whether all parameters are identifiable.
-        unseen: groups of parameters that are identifiable in combinations only.
+        unseen: groups of parameters that are not identifiable, or in combinations only.
         mesh_error: mesh error of the fitted scene, as a fraction of its largest displacement, or None if unknown.
         runs: number of runs.
         seconds: duration [s].
@@ -159,7 +159,7 @@ class FitResult:
 
     @property
     def model_rejected(self) -> bool:
-        """Whether no parameter values reproduce the observations."""
+        """Whether the observations reject the model, with any parameter values."""
         return self.rejection is not None
 
     def as_json(self) -> dict[str, Any]:

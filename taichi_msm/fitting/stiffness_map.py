@@ -50,7 +50,7 @@ class MapSettings:
     Attributes:
         resolution: number of cells per side, R.
         limits: bounds of the factors.
-        force: component of a force, whose factor all forces share, or None if forces are known.
+        force: component of a force, whose fitted factor scales all forces; None for fixed forces.
     """
 
     resolution: int
@@ -79,7 +79,9 @@ def map_settings(
     option = f"--free {KEY}"
     force_keys = [key for key in free if key != KEY]
     if conflicting := [key for key in force_keys if not FORCE_KEY.fullmatch(key)] + force_keys[1:]:
-        reason = f"a map is found alone, as its level and {conflicting[0]} can look alike; leave that out"
+        reason = (
+            f"only a map alone is identifiable, as {conflicting[0]} can have the effect of its level; leave that out"
+        )
         raise SceneError([f"{option}: {reason}, or free one component of a force, whose factor all forces share"])
     if scene.tissue is None:
         raise SceneError([f"{option}: the scene has springs; describe them as tissue"])
@@ -125,7 +127,7 @@ def fit_map(
     if invalid := list(_faults(observations, scene, settings)):
         raise SceneError(invalid)
     assert observations.sigma is not None
-    # Below this factor, with a margin of 5 %, springs have no positive rest length.
+    # Smaller factors leave springs no positive rest length; 1.05 is a margin.
     low = max(settings.limits[0], 1.05 * plan.material.tension)
     if low >= settings.limits[1]:
         fault = f"{scene.kind}.pretension leaves springs no length below {plan.material.tension:.3g}"
@@ -151,7 +153,7 @@ def fit_map(
         coarse_factors = MapGrid(settings.resolution, _cells(coarse_plan)).factors(start[:cell_count])
         coarse_model = PointModel(coarse_plan.scene, observations, coarse_plan.grid.frames + 1)
         coarse_points = coarse_model.points(Adjoint(coarse_plan, device).run(coarse_factors, report_progress))
-        # Richardson's estimate of order 2 for half the cells per side.
+        # Richardson extrapolation of order 2, from half the cells per side.
         differences = (coarse_model.observe(coarse_points) - model.observe(points))[observations.known] / 3.0
         mesh_shift = float(np.sqrt(np.nanmean(differences**2)))
     sigma = math.hypot(observations.sigma, mesh_shift)
@@ -207,11 +209,11 @@ def _force_estimate(parameter: Parameter, solution: MapSolution) -> tuple[Estima
 def _faults(observations: PointObservation, scene: Scene, settings: MapSettings) -> Iterator[str]:
     """Yield the faults that need no run."""
     if observations.sigma is None:
-        fault = "the errors of the observations decide how smooth a map is; give their standard deviation by --sigma"
+        fault = "the smoothness of a map follows from the errors; give their standard deviation by --sigma"
         yield f"{observations.name}: sigma: missing: {fault}"
         return
     if (count := int(observations.known.sum())) <= (cell_count := settings.resolution**2):
-        fault = f"{count} numbers were observed, too few for {cell_count} cells of a map"
+        fault = f"{count} observed numbers are too few for {cell_count} cells of a map"
         remedy = f"observe more points, or take fewer cells: --resolution {max(2, math.isqrt(max(count - 1, 0)))}"
         yield f"{observations.name}: {fault}; {remedy}"
         return
@@ -273,7 +275,7 @@ def _notes(
     """Yield warnings; `residuals` are in [m] or [px]."""
     assert observations.sigma is not None
     if (unknown_count := int(fitted_map.unknown.sum())) > 0:
-        yield f"{unknown_count} of {fitted_map.factors.size} cells are unknown: nothing moves there; press there"
+        yield f"{unknown_count} of {fitted_map.factors.size} cells are unknown, as nothing moves there; press there"
     if mesh_shift > observations.sigma / 2:
         size = f"about {rounded(mesh_shift)} {observations.unit}, and sigma is {rounded(observations.sigma)}"
         remedy = "the map is as smooth as both require; take more sheet.points"

@@ -3,9 +3,9 @@
     1/2 sum ((predicted - observed) / sigma)^2 + w/2 sum (x_p - x_q)^2        over all neighbouring map cells p, q
 
 is minimised over the logs x of the factors of all map cells, within bounds, by L-BFGS-B with the adjoint gradient. The
-weight w follows from the discrepancy principle: it is the largest one with residuals that sigma explains. Only R^2
-degrees of freedom of the residuals depend on the map; so the excess of chi-square above its minimum is compared with
-its expectation, R^2 minus the effective number of parameters, tr(J^T J (J^T J + w L)^-1), with sigma = 1. J is the
+weight w is the largest one with residuals that sigma explains: the discrepancy principle. As only R^2 degrees of
+freedom of the residuals depend on the map, the excess of chi-square above its minimum is compared with its expectation,
+R^2 minus the effective number of parameters, tr(J^T J (J^T J + w L)^-1), with sigma = 1. J is the
 Jacobian of the predictions by x, L the matrix of the second sum. J is evaluated again at the end of a search, until the
 weight is stable.
 
@@ -34,7 +34,7 @@ MAX_KNOWN_ERROR = 0.5
 # Largest change of a stable weight, as a factor.
 MAX_WEIGHT_CHANGE = 2.0
 
-# Largest change of the log of a map cell from the linearisation to the start of a search.
+# Largest step of the log of a map cell from the linearised solution, as the start of a search.
 MAX_INITIAL_STEP = 1.0
 
 # Step of finite differences of the log of a map cell.
@@ -46,8 +46,8 @@ class SmoothnessWeight(NamedTuple):
 
     Attributes:
         weight: w.
-        step: change of x to the map with this weight, from the linearised predictions, shape (R^2,).
-        weights: candidates, up to this weight, shape (candidates,).
+        step: change of x to the minimum with w, linearised, shape (R^2,).
+        weights: candidates, from the largest to w, shape (candidates,).
         excess: excess of chi-square above its minimum, for each candidate, shape (candidates,).
         expected: expected excess, shape (candidates,).
     """
@@ -117,7 +117,7 @@ class MapSolution:
     """Estimated map.
 
     Attributes:
-        x: logs of the factors, and of that of the forces where it is free, shape (R^2,) or (R^2 + 1,).
+        x: logs of the factors, and of the factor of the forces if free, shape (R^2,) or (R^2 + 1,).
         errors: standard errors of x, NaN if unknown.
         excess: chi-square of the best map per degree of freedom, at least 1.
         choice: weight of the smoothness.
@@ -167,14 +167,14 @@ class MapSearch:
         self.runs = 0
 
     def predict(self, x: Array) -> tuple[Array, Array]:
-        """Return the points [m], shape (N, T, 3), and the observations with a map, shape (N, T, 3 or 2)."""
+        """Return predicted points [m], shape (N, T, 3), and values, shape (N, T, 3 or 2)."""
         self._pause()
         self.runs += 1
         cells, scene = x[: self._cells], with_scaled_forces(self._model.scene, *np.exp(x[self._cells :]))
         points = self._model.points(self._adjoint.run(self._grid.factors(cells), self._pause, scene))
         predicted = self._model.observe(points)
         if not np.isfinite(predicted[self._observations.known]).all():
-            fault = "an observed point gets behind the eye of the camera with some maps"
+            fault = "an observed point is behind the eye of the camera for some maps"
             remedy = "give NaN in its place, or narrower --bounds"
             raise SceneError([f"{self._observations.name}: pixel: {fault}; {remedy}"])
         return points, predicted
@@ -250,7 +250,7 @@ class MapGrid:
         )
 
     def factors(self, x: Array) -> Array:
-        """Interpolate the factors of the sheet's cells from the logs x of the map cells, shape (R^2,)."""
+        """Return the factors of the sheet's cells from the logs x of the map cells, shape (R^2,)."""
         return np.asarray(self._down @ np.exp(x).reshape(self.resolution, -1) @ self._across.T)
 
     def backward(self, x: Array, gradient: Array) -> Array:

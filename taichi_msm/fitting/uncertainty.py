@@ -37,14 +37,14 @@ class Uncertainty:
 
     Attributes:
         scales: standard deviations of the observations, given or estimated.
-        factor: f.
+        factor: f, at least 1.
         freedom: degrees of freedom.
         independent: effective number of independent observations.
         residuals: r, shape (known,).
         weighted: W^(1/2) J, shape (known, n).
-        directions: V, with uncorrelated combinations of x as columns, the most certain one first, shape (n, n).
-        root: F with C = F F^T, shape (n, n).
-        widening: factor of the deviations by K, shape (n,).
+        directions: V, shape (n, n); columns are uncorrelated combinations of x, the most certain first.
+        root: F, shape (n, n), with C = F F^T.
+        widening: ratio of the deviations with K to those with K = 1, shape (n,).
     """
 
     scales: Scales
@@ -82,12 +82,12 @@ class Uncertainty:
 
     @property
     def unidentified(self) -> NDArray[np.bool_]:
-        """Mask of the parameters with a component in an unidentified direction, without a valid `shift`, shape (n,)."""
+        """Mask of the parameters in unidentified directions, where `shift` is invalid, shape (n,)."""
         directions = self.directions[:, self.direction_deviations > MAX_DIRECTION_DEVIATION]
         return np.linalg.norm(directions, axis=1) > MIN_COMPONENT * 50
 
     def shift(self, rows: Array) -> Array:
-        """Return the shift of x, shape (n,), due to an error of the predictions, in units of r, shape (known,)."""
+        """Return the shift of x, shape (n,), by errors `rows` of the predictions, shape (known,), in units of r."""
         identified = self.directions[:, self.direction_deviations <= MAX_DIRECTION_DEVIATION]
         return identified @ np.linalg.lstsq(self.weighted @ identified, rows, rcond=None)[0]
 

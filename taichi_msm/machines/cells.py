@@ -1,6 +1,6 @@
-"""Cells of a text table or of a workbook by row and column, and numbers in them.
+"""Readers of the cells of text tables and workbooks, and parser of their numbers.
 
-A text may be UTF-8, UTF-16 or Windows-1252; its separator is the one that splits its header.
+Texts are UTF-8, UTF-16 or Windows-1252; their separator is detected from the header.
 """
 
 from __future__ import annotations
@@ -24,23 +24,23 @@ from taichi_msm.scene.section import MAX_MAGNITUDE
 
 Row = list[str]
 
-# Limits: size of the file, unpacked size of a workbook, and cells of a sheet.
+# Largest size of a file and of an unpacked workbook [bytes], and largest number of cells of a sheet.
 MAX_BYTES, MAX_UNPACKED_BYTES, MAX_CELLS = 2**26, 2**29, 10**7
 
 WORKBOOK_SUFFIX = ".xlsx"
 
-# Separators by name, in the order in which they are tried on a header: names may contain commas and spaces.
+# Separators by name, in order of trial: tabs and semicolons first, as titles may contain commas and spaces.
 SEPARATORS = {"tabs": "\t", "semicolons": ";", "commas": ",", "bars": "|", "wide spaces": "", "spaces": ""}
 
-# Where spaces separate the names of a header; a unit in brackets belongs to the name before it.
+# Patterns of the spaces between titles; a single space before a unit in brackets does not separate.
 SPACES = {"wide spaces": re.compile(r"\s{2,}"), "spaces": re.compile(r"\s+(?![\[(])")}
 
-# A letter that numbers do not have.
+# Letter other than e, which numbers contain.
 LETTER = re.compile(r"[^\W\d_eE]")
 
 NUMBER_PATTERN = re.compile(r"[+-]?(?:\d+(?:\.(\d*))?|\.(\d+))(?:[eE]([+-]?\d{1,3}))?", re.ASCII)
 
-# Thousands in groups, with the mark of the groups and the decimal mark.
+# Numbers with grouped thousands, 1,234.5 and 1.234,5, by decimal mark.
 GROUPS = {
     mark: re.compile(rf"[+-]?[1-9]\d{{0,2}}(?:\{group}\d{{3}})+\{mark}\d+", re.ASCII) for mark, group in (",.", ".,")
 }
@@ -52,11 +52,11 @@ class Grid:
 
     Attributes:
         name: name of the file.
-        sheet: sheet of a workbook, empty for a text.
-        rows: cells of every row, up to the last filled one.
-        separator: name of the separator of a text.
-        counts: number of cells in every row of a text, with the empty ones at its end.
-        merged: rows and columns of cells that are merged with the one to their right.
+        sheet: name of the sheet of a workbook, empty for a text.
+        rows: cells of every row, without empty ones at the end.
+        separator: key of `SEPARATORS`, empty for a workbook.
+        counts: number of cells of every row of a text, including empty ones at the end.
+        merged: (row, column) of every cell that is merged with its right neighbour.
     """
 
     name: str
@@ -68,11 +68,11 @@ class Grid:
 
     @property
     def title(self) -> str:
-        """The file, and the sheet of a workbook."""
+        """Name of the file, followed by the sheet of a workbook."""
         return f"{self.name}: {self.sheet}" if self.sheet else self.name
 
     def place(self, row: int, column: int = 0) -> str:
-        """Return the place of a row of a text, or of a cell of a sheet, for a message.
+        """Return the line of a text, as FILE:LINE, or the cell of a workbook, as FILE: SHEET!A1, for messages.
 
         Args:
             row: index of the row, from 0.
@@ -85,38 +85,38 @@ class Grid:
         return f"{self.name}: {self.sheet}!{get_column_letter(column + 1)}{row + 1}"
 
     def has_content(self, row: int) -> bool:
-        """Return whether a row is not empty, a ruling or a comment of a text."""
+        """Return whether a row has letters or digits, and is not a comment of a text."""
         cells = self.rows[row]
         is_comment = not self.sheet and cells[:1] and cells[0].startswith(("#", "%"))
         return not is_comment and any(character.isalnum() for cell in cells for character in cell)
 
-    def require_names(self, row: int, header: int) -> None:
-        """Check that a row of a text has no more cells than its header has names.
+    def require_width(self, row: int, header: int) -> None:
+        """Check that a row of a text is not longer than its header.
 
         Args:
             row: index of the row.
-            header: index of the row of the names.
+            header: index of the header.
 
         Raises:
-            SceneError: when it has more.
+            SceneError: when the row is longer.
         """
         cells, names = self.rows[row], self.rows[header]
         if not self.sheet and len(cells) > len(names):
             is_decimal = self.separator == "commas"
             remedy = "with decimal commas, separate cells by semicolons" if is_decimal else "name each column"
-            fault = f"{len(cells)} cells separated by {self.separator} as in the header, and {len(names)} columns"
+            fault = f"{len(cells)} cells separated by {self.separator}, but {len(names)} columns in the header"
             raise SceneError([f"{self.place(row)}: {fault}; {remedy}"])
 
     def numbers(self, header: int, cells: Iterable[tuple[int, int]], remedy: str) -> list[tuple[float, int]]:
-        """Return the numbers of cells, as of `parse_number`.
+        """Return the number of every cell, with the power of its last digit, as `parse_number` does.
 
         Args:
-            header: index of the row of the names.
-            cells: row and column of each cell.
-            remedy: remedy for a cell that is not a number.
+            header: index of the header, for messages.
+            cells: (row, column) of every cell.
+            remedy: end of the message about a cell that is not a number.
 
         Raises:
-            SceneError: when a cell is not a number, or has another decimal mark than an earlier one.
+            SceneError: when a cell is not a number, or when decimal marks differ.
         """
         numbers, known_mark = [], ""
         for row, column in cells:
@@ -129,7 +129,7 @@ class Grid:
                 raise SceneError([f"{where}; {remedy}"])
             mark = decimal_mark(cell)
             if mark and known_mark not in ("", mark):
-                raise SceneError([f"{where}; both . and , are decimal marks in this table; take one"])
+                raise SceneError([f"{where}; the table has both . and , as decimal marks; take one"])
             known_mark = mark or known_mark
             numbers.append(number)
         return numbers
@@ -140,8 +140,8 @@ def read_text(name: str, is_header: Callable[[Row], bool], expected: str) -> Gri
 
     Args:
         name: path of the file.
-        is_header: function that returns whether a row names the columns; it selects the separator.
-        expected: remedy for a file that cannot be read.
+        is_header: whether a split row is a header; selects the separator.
+        expected: description of a readable file, for messages.
 
     Raises:
         SceneError: when the file cannot be read, or is not a text.
@@ -153,19 +153,19 @@ def read_text(name: str, is_header: Callable[[Row], bool], expected: str) -> Gri
         if LETTER.search(line):
             headers = {mark: row for mark in SEPARATORS if is_header(row := _split_header(line, mark))}
         if headers:
-            separator = _separator(headers, lines[n + 1 :])
-        cells = headers[separator] if headers else _cells(line, separator)
-        rows.append(_stripped(cells))
+            separator = _choose_separator(headers, lines[n + 1 :])
+        cells = headers[separator] if headers else _split_line(line, separator)
+        rows.append(_strip(cells))
         counts.append(len(cells))
     return Grid(name, "", rows, separator, counts)
 
 
 def read_workbook(name: str, expected: str) -> dict[str, Grid]:
-    """Return the sheets of a workbook by name, without chart sheets.
+    """Return the worksheets of a workbook by name.
 
     Args:
         name: path of the file.
-        expected: remedy for a file that cannot be read.
+        expected: description of a readable file, for messages.
 
     Raises:
         SceneError: when the file cannot be read, or is not a workbook.
@@ -181,25 +181,25 @@ def read_workbook(name: str, expected: str) -> dict[str, Grid]:
             unpacked = sum(entry.file_size for entry in archive.infolist())
         if unpacked > MAX_UNPACKED_BYTES:
             raise SceneError([f"{name}: {unpacked / 1e6:.0f} MB unpacked; save the sheet as CSV"])
-        # openpyxl warns of parts that it leaves out, such as styles.
+        # openpyxl warns about ignored parts, such as styles.
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
-            # The values as saved, and the formulas for cells that were saved without one.
+            # Saved values, and formulas where no value was saved.
             values, formulas = (openpyxl.load_workbook(io.BytesIO(data), data_only=saved) for saved in (True, False))
-        return {sheet.title: _sheet(name, sheet, formulas[sheet.title]) for sheet in values.worksheets}
+        return {sheet.title: _read_sheet(name, sheet, formulas[sheet.title]) for sheet in values.worksheets}
     except SceneError:
         raise
-    # openpyxl has no error of its own for a damaged file.
+    # openpyxl raises errors of any kind for a damaged file.
     except Exception as error:
         reason = f"not a workbook, or a damaged one ({type(error).__name__})"
         raise SceneError([f"{name}: {reason}; save it again as .xlsx, or as CSV"]) from None
 
 
 def parse_number(cell: str) -> tuple[float, int] | None:
-    """Parse a number with a decimal point or comma, perhaps with groups of thousands, and U+2212 as a minus.
+    """Parse a number; accept decimal commas, grouped thousands, and U+2212 as minus.
 
     Returns:
-        The number, and the power of ten of its last digit; None if the cell is not a number.
+        Number, and power of ten of its last digit; None for a cell that is not a number.
     """
     text = cell.replace("\N{MINUS SIGN}", "-")
     if (mark := decimal_mark(text)) and GROUPS[mark].fullmatch(text):
@@ -211,16 +211,16 @@ def parse_number(cell: str) -> tuple[float, int] | None:
 
 
 def decimal_mark(cell: str) -> str:
-    """Return the last mark of a cell, or an empty text."""
+    """Return the last . or , in a cell, or an empty string."""
     return "," if cell.rfind(",") > cell.rfind(".") else "." if "." in cell else ""
 
 
-def _sheet(name: str, sheet: Any, formulas: Any) -> Grid:
-    """Read the cells of a sheet as texts."""
+def _read_sheet(name: str, sheet: Any, formulas: Any) -> Grid:
+    """Read the cells of a worksheet as strings."""
     if (cells := sheet.max_row * sheet.max_column) > MAX_CELLS:
         raise SceneError([f"{name}: {sheet.title}: {cells} cells; delete the empty rows and columns around the table"])
     rows = [
-        _stripped([_text(value if value is not None else formula) for value, formula in zip(*pair, strict=False)])
+        _strip([_format_cell(value if value is not None else formula) for value, formula in zip(*pair, strict=False)])
         for pair in zip(sheet.iter_rows(values_only=True), formulas.iter_rows(values_only=True), strict=False)
     ]
     merged = frozenset(
@@ -232,8 +232,8 @@ def _sheet(name: str, sheet: Any, formulas: Any) -> Grid:
     return Grid(name, sheet.title, rows, merged=merged)
 
 
-def _text(value: object) -> str:
-    """Write a cell of a workbook as a text, a number with the digits that Excel shows."""
+def _format_cell(value: object) -> str:
+    """Format the value of a cell, numbers with the 15 digits of Excel."""
     if isinstance(value, float):
         return format(value, ".15g")
     if isinstance(value, datetime.date | datetime.time | datetime.timedelta):
@@ -241,20 +241,22 @@ def _text(value: object) -> str:
     return "" if value is None else str(value)
 
 
-def _stripped(cells: Row) -> Row:
-    """Strip spaces, and empty cells at the end."""
+def _strip(cells: Row) -> Row:
+    """Normalise spaces, and drop empty cells at the end."""
     cells = [" ".join(cell.split()) for cell in cells]
     while cells and not cells[-1]:
         cells.pop()
     return cells
 
 
-def _separator(headers: dict[str, Row], lines: list[str]) -> str:
-    """Return the first separator of a header that separates three numbers of the next line of numbers, or the first."""
+def _choose_separator(headers: dict[str, Row], lines: list[str]) -> str:
+    """Return the first separator that splits the next line of numbers into three or more, or else the first."""
     line = next((line for line in lines if line.strip() and not LETTER.search(line)), "")
 
     def count(separator: str) -> int:
-        return sum(parse_number(cell) is not None for cell in _split(line, separator)[: len(headers[separator])])
+        return sum(
+            parse_number(cell) is not None for cell in _split_stripped(line, separator)[: len(headers[separator])]
+        )
 
     return next((separator for separator in headers if count(separator) >= 3), next(iter(headers)))
 
@@ -262,17 +264,17 @@ def _separator(headers: dict[str, Row], lines: list[str]) -> str:
 def _split_header(line: str, separator: str) -> Row:
     """Split a line that may be a header."""
     if spaces := SPACES.get(separator):
-        return _stripped(spaces.split(line.replace('"', "").strip("#% \t")))
-    return _split(line, separator)
+        return _strip(spaces.split(line.replace('"', "").strip("#% \t")))
+    return _split_stripped(line, separator)
 
 
-def _split(line: str, separator: str) -> Row:
+def _split_stripped(line: str, separator: str) -> Row:
     """Split a line of text, without empty cells at the end."""
-    return _stripped(_cells(line, separator))
+    return _strip(_split_line(line, separator))
 
 
-def _cells(line: str, separator: str) -> Row:
-    """Return the cells of a line of text; a line before the first header, without a separator, is a cell."""
+def _split_line(line: str, separator: str) -> Row:
+    """Split a line, with empty cells at the end; without a separator, before the first header, it is one cell."""
     if separator in SPACES:
         return line.replace('"', "").split()
     if separator:
@@ -296,7 +298,7 @@ def _read_bytes(name: str, expected: str) -> bytes:
 
 
 def _decode(name: str, data: bytes, expected: str) -> str:
-    """Decode a text; without a byte order mark, zeros at even or odd places mean UTF-16."""
+    """Decode a text; without a byte order mark, zero bytes mean UTF-16, and their parity its byte order."""
     if data.startswith((b"PK", b"\xd0\xcf\x11\xe0")):
         raise SceneError([f"{name}: a workbook; {expected}"])
     if data.startswith((b"\xff\xfe", b"\xfe\xff")):

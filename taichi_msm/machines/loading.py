@@ -1,11 +1,11 @@
-"""Test of a testing machine as the motion of a scene's position-controlled tool, with contact, noise and frames.
+"""Machine test as the motion of a scene's position-controlled tool, with depth of contact, noise and frames.
 
-The tool moves along a line, from the first contact with the sheet at rest, or a clamp from its rest. It waits there
-until the table's depth exceeds the depth of contact, which of a clamp is that of the first row.
+The tool moves along a line, and its travel is max(0, depth - depth of contact). An instrument starts at first contact
+with the sheet at rest; a clamp starts at its rest, and its depth of contact is that of the first row.
 
-Frames are equidistant in time. The equilibria of tissue without relaxation do not depend on time: their frames are
-equidistant in depth, from slightly above the contact to the greatest depth, and later rows are not used. The depth and
-the force of a frame are means over the rows within half a frame, or interpolated if there are none.
+Frames are equidistant in time. Equilibria without relaxation do not depend on time: their frames are equidistant in
+depth, from slightly before contact to the greatest depth; later rows are ignored. Depth and force of a frame are means
+over the rows within half a frame, or interpolated if there are none.
 """
 
 from __future__ import annotations
@@ -25,21 +25,21 @@ from taichi_msm.scene.scene import Scene
 # Default frames per second, and largest number of frames at this default.
 FRAMES_PER_SECOND, MAX_FRAMES = 10.0, 200
 
-# Number of frames of an equilibrium without relaxation.
+# Number of frames that are equidistant in depth.
 DEPTH_FRAMES = 100
 
-# Smallest force of a contact [noise].
+# Smallest force in contact, in units of the noise.
 CONTACT_NOISES = 5.0
 
 
 @dataclass(frozen=True, eq=False)
 class Approach:
-    """Line of a position-controlled tool, from its first contact with the sheet at rest, or from a clamp's rest.
+    """Straight path of a tool, from first contact with the sheet at rest, or from the rest of a clamp.
 
     Attributes:
         probe: index of the tool in the scene.
-        start: centre of the tip at first contact, or 0, the displacement of a clamp at rest [m], shape (3,).
-        direction: unit vector, shape (3,).
+        start: centre of the tip at first contact [m], shape (3,); 0, the displacement at rest, for a clamp.
+        direction: unit vector of the motion, shape (3,).
         tip_height: height of the centre above the lowest point of the tip [m].
         size: height and width of the sheet [m].
         is_clamp: whether the tool is a clamp.
@@ -53,16 +53,16 @@ class Approach:
     is_clamp: bool
 
     def place(self, data: dict[str, Any], travel: Array, rate: float) -> dict[str, Any]:
-        """Return a scene's data with the path of the tool, and the times, of a test.
+        """Return a scene's data with the path, duration and frame rate of a test.
 
         Args:
             data: data of a scene.
-            travel: distance from the first contact at every frame [m], shape (frames,).
+            travel: distance from `start` at every frame [m], shape (frames,).
             rate: frames per second.
         """
         (height, width), time = self.size, np.arange(len(travel)) / rate
         x, y, z = (self.start + travel[:, None] * self.direction).T
-        # Keyframes [t, across, down, height], of a clamp [t, x, y, z].
+        # Keyframes are [t, across, down, height], and those of a clamp [t, x, y, z].
         places = (x, y, z) if self.is_clamp else (x / width + 0.5, 0.5 - y / height, z - self.tip_height)
         probes = list(data["probes"])
         probes[self.probe] = {**probes[self.probe], "path": np.stack([time, *places], axis=1).tolist()}
@@ -71,21 +71,23 @@ class Approach:
 
 
 def find_approach(scene: Scene) -> Approach:
-    """Return the line of the scene's tool; raise a SceneError unless one tool moves, over the sheet."""
+    """Return the path of the scene's tool; raise a SceneError unless one tool moves, toward the sheet."""
     tools = build_tools(scene.probes, scene.sheet)
     if len(tools) != 1:
-        fault = f"{len(tools)} position-controlled tools, and a table of a testing machine is of one"
-        raise SceneError([f"probes: {fault}; give one probe a path and an instrument or a clamp, and no other"])
+        fault = f"{len(tools)} position-controlled tools, but a machine test has one"
+        raise SceneError([f"probes: {fault}; give exactly one probe a path, with an instrument or a clamp"])
     (tool,) = tools
     key, offsets = f"probes.{tool.probe}.path", tool.tip_centres - tool.tip_centres[0]
     farthest = offsets[np.linalg.norm(offsets, axis=1).argmax()]
     if not farthest.any():
-        raise SceneError([f"{key}: stays at one place; give it a second key, in the direction of the test"])
+        raise SceneError([f"{key}: does not move; add a key in the direction of the test"])
     direction = farthest / np.linalg.norm(farthest)
     is_clamp = isinstance(tool, Clamp)
     start = np.zeros(3) if is_clamp else _first_contact(tool, direction, scene)
     if start is None:
-        raise SceneError([f"{key}: the line from its first key to the farthest misses the sheet; direct it there"])
+        raise SceneError(
+            [f"{key}: the line from its first to its farthest key misses the sheet; direct it at the sheet"]
+        )
     tip_height = float(tool.tip_centres[0, 2] - tool.heights[0])
     return Approach(tool.probe, start, direction, tip_height, scene.sheet.size, is_clamp)
 
@@ -94,8 +96,8 @@ def _first_contact(tool: Tool, direction: Array, scene: Scene) -> Array | None:
     """Return the centre of the tip at first contact [m], shape (3,), or None if the tool misses the sheet."""
     start, tolerance = tool.tip_centres[0], 1e-9 * tool.radius
     travel, reach = 0.0, float(np.linalg.norm(start)) + tool.length + math.hypot(*scene.sheet.size)
-    # The distance from the sheet changes by at most the travel, so that the tool may advance by it (sphere tracing).
-    # That of a tilted plate is approximate, so that it may have to go back.
+    # Sphere tracing: the tool advances by its gap to the sheet. The gap of a tilted plate is approximate, so the tool
+    # may have to go back.
     goes_back, tip_height = False, tool.tip_centres[0, 2] - tool.heights[0]
     for _ in range(1000):
         centre = start + travel * direction
@@ -112,16 +114,16 @@ def _first_contact(tool: Tool, direction: Array, scene: Scene) -> Array | None:
 
 @dataclass(frozen=True, eq=False)
 class Loading:
-    """A machine test at the frames of its scene.
+    """Machine test, sampled at the frames of a scene.
 
     Attributes:
-        test: the test, with the median of the first forces subtracted.
+        test: the test, without force offset, and with times from 0.
         rate: frames per second of the scene.
-        time: times of the table at every frame [s], shape (frames,).
-        depth: depths of the table at every frame [m], shape (frames,).
-        force: measured force along the tool's direction [N], shape (frames,).
+        time: time of the test at every frame [s], shape (frames,).
+        depth: depth at every frame, as in the table [m], shape (frames,).
+        force: measured force along the tool's direction at every frame [N], shape (frames,).
         noise: standard deviation of the force in the first rows [N].
-        contact: depth of contact [m of the table].
+        contact: depth of contact, as in the table [m].
     """
 
     test: MachineTest
@@ -149,7 +151,7 @@ class Loading:
         return max(self.noise, 1e-5 * self.peak)
 
     def travel(self, contact: float | None = None) -> Array:
-        """Return the distance of the tool from its first contact at every frame [m], shape (frames,)."""
+        """Return the travel of the tool [m], shape (frames,); `contact`: another depth of contact [m]."""
         travel = np.maximum(self.depth - (self.contact if contact is None else contact), 0.0)
         travel[0] = 0.0
         return travel
@@ -158,22 +160,22 @@ class Loading:
 def build_loading(
     test: MachineTest, scene: Scene, rate: float | None = None, contact: float | None = None, *, is_clamp: bool = False
 ) -> Loading:
-    """Return a machine test at frames, with its noise and contact.
+    """Return a machine test sampled at frames, with estimated noise and depth of contact.
 
     Args:
         test: the test.
-        scene: the scene; its motion and relaxation determine the frames.
-        rate: frames per second. By default frames are equidistant in depth without relaxation, otherwise 10 or less per
-            second.
-        contact: depth of contact [m of the table]; by default from the forces, or that of the first row of a clamp.
+        scene: scene of the tool and the tissue.
+        rate: frames per second; by default at most 10, or equidistant in depth for equilibria without relaxation.
+        contact: depth of contact, as in the table [m]; by default estimated from the forces, for a clamp the first
+            depth.
         is_clamp: whether the tool is a clamp.
 
     Raises:
         SceneError: when the force does not rise with the depth, or the depth of contact is outside the table.
     """
-    first = test.force[: _noise_rows(test)]
+    first = test.force[: _count_noise_rows(test)]
     offset = float(np.median(first))
-    # 1.48 is the ratio of the standard deviation to the median of the magnitudes, of normal errors.
+    # 1.48 converts the median magnitude of normal errors to their standard deviation.
     noise = max(1.48 * float(np.median(np.abs(first - offset))), test.digit)
     test = replace(test, force=test.force - offset, time=test.time - test.time[0])
     peak = int(test.force.argmax())
@@ -185,11 +187,11 @@ def build_loading(
     if test.depth[peak] <= contact:
         fault = (
             f"the depth falls from {contact:.4g} to {test.depth[peak]:.4g} m while the force rises to "
-            f"{test.force[peak]:.4g} N: is it counted against the motion of the tool?"
+            f"{test.force[peak]:.4g} N: is its sign opposite to the motion of the tool?"
         )
-        raise SceneError([f"{test.name}: {fault} Choose another by --columns, or change its sign"])
+        raise SceneError([f"{test.name}: {fault} Choose another depth by --columns, or change its sign"])
     if rate is None and scene.time.at_rest and not (scene.tissue and scene.tissue.relaxation):
-        return _in_depth(test, noise, contact)
+        return _sample_in_depth(test, noise, contact)
     if rate is None:
         rate = min(FRAMES_PER_SECOND, MAX_FRAMES / float(test.time[-1]))
     frames = max(1, math.ceil(float(test.time[-1]) * rate - 1e-6))
@@ -198,8 +200,8 @@ def build_loading(
     return Loading(test, rate, time, depth, force, noise, contact)
 
 
-def _noise_rows(test: MachineTest) -> int:
-    """Return the number of rows from which the noise is estimated."""
+def _count_noise_rows(test: MachineTest) -> int:
+    """Return the number of first rows, which the noise is estimated from."""
     return max(10, math.ceil(0.05 * len(test.force)))
 
 
@@ -208,14 +210,16 @@ def _contact_row(test: MachineTest, noise: float, peak: int) -> int:
     without_force = np.flatnonzero(test.force[: peak + 1] <= CONTACT_NOISES * noise)
     row = int(without_force[-1]) if len(without_force) else 0
     if row == peak:
-        fault = f"the force never exceeds its noise in the first {_noise_rows(test)} rows, {noise:.3g} N, by 5 times"
-        remedy = "if the tool touches from the start, give its depth by --contact; or choose the force by --columns"
+        fault = f"the force never exceeds 5 times its noise, {noise:.3g} N in the first {_count_noise_rows(test)} rows"
+        remedy = "give the depth by --contact if the tool touches from the start, or choose the force by --columns"
         raise SceneError([f"{test.name}: {fault}; {remedy}, or cut the table by --window"])
     return row
 
 
 def late_contact_note(loading: Loading, key: str) -> str | None:
-    """Return a note about a contact found too late, as the force rises in the rows of the noise, or None.
+    """Return a warning about a contact that is estimated too late, or None.
+
+    The force then rises already in the first rows, and their noise is estimated too large.
 
     Args:
         loading: the test.
@@ -223,21 +227,21 @@ def late_contact_note(loading: Loading, key: str) -> str | None:
     """
     from scipy.stats import kendalltau
 
-    test, count = loading.test, _noise_rows(loading.test)
+    test, count = loading.test, _count_noise_rows(loading.test)
     significant = CONTACT_NOISES * loading.noise
     correlation = kendalltau(test.depth[:count], test.force[:count]).statistic
-    # Of 10 independent rows, a rank correlation above 0.55 has a probability of 0.015.
+    # Ten independent rows have a rank correlation above 0.55 with a probability of 0.015.
     if not (significant > 0.01 * loading.peak and correlation > 0.55):
         return None
     return (
-        f"{test.name}: the force rises within the first {count} rows, from which its noise, {loading.noise:.3g} N, is "
-        f"estimated: the tool touches earlier than at {loading.contact:.4g} m, where the force is {significant:.3g} N; "
+        f"{test.name}: the force rises within the first {count} rows, so its noise, {loading.noise:.3g} N, is "
+        f"too large: the tool touches before {loading.contact:.4g} m, where the force is {significant:.3g} N; "
         f"find the depth by --free {key}, or give it by --contact"
     )
 
 
-def _in_depth(test: MachineTest, noise: float, contact: float) -> Loading:
-    """Compute frames that are equidistant in depth, up to the greatest one."""
+def _sample_in_depth(test: MachineTest, noise: float, contact: float) -> Loading:
+    """Sample a test at equidistant depths, up to the greatest one."""
     rows = int(test.depth.argmax()) + 1
     deepest = float(test.depth[rows - 1])
     first = max(contact - 0.05 * (deepest - contact), float(test.depth[:rows].min()))
@@ -250,9 +254,9 @@ def _in_depth(test: MachineTest, noise: float, contact: float) -> Loading:
 
 
 def _means(coordinate: Array, at: Array, half_width: float, columns: Sequence[Array]) -> list[Array]:
-    """Average columns over the rows within `half_width` of each of n coordinates `at`, or interpolate them.
+    """Average columns around the coordinates `at`, shape (n,), over the rows within `half_width`.
 
-    `coordinate` of every row increases; columns have the shape (rows,), and their means (n,).
+    Columns are interpolated where there are none. `coordinate`, shape (rows,), increases.
     """
     # Rows on the border of two frames belong to both, up to rounding.
     reach = half_width * (1 + 1e-6)

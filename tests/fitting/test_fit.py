@@ -575,11 +575,11 @@ def test_exact_fit(tracks: Arrays, robust: bool) -> None:
     result = estimate(first.scene, exact, free, robust=robust, profile=True)
     assert (result.residual, values(result), result.identifiable) == (0, values(first), True)
     assert all(0 < each.standard_error < 1e-6 * each.value for each in result.parameters.values())
-    assert any("the residual is next to 0" in note and "--sigma" in note for note in result.notes)
+    assert any("the residual is almost 0" in note and "--sigma" in note for note in result.notes)
     assert not any("nan" in line or "inf" in line for line in result.summary()[:-1])
     result = estimate(first.scene, exact, free, robust=robust, sigma=1e-5)
     assert result.chi_square == 0
-    assert not any("the residual is next to 0" in note for note in result.notes)
+    assert not any("the residual is almost 0" in note for note in result.notes)
 
 
 def test_points_behind_the_camera(motion: Array, device: Device, message: Messages) -> None:
