@@ -396,4 +396,4 @@ def test_tests_named_on_pages_exist() -> None:
     named = re.findall(r"`(tests/[\w/]+\.py)::(\w+)`", read(DOCS / "tests.md").split("\n## Mutants\n")[0])
     assert len(named) > 100
     for file, test in named:
-        assert f"\ndef {test}(" in read(ROOT / file), test
+        assert re.search(rf"^(async )?def {test}\(", read(ROOT / file), re.MULTILINE), test
