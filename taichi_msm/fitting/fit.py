@@ -201,7 +201,7 @@ def _fit(runs: Runs, scene: Scene, method: Method) -> FitResult:
     unidentified = unidentified_groups(parameters, solution.x, uncertainties, forces=measures_forces)
     rejection_reason = _rejection(misfit, solution, uncertainties, error_correlation)
     tests = fitted_tests(machine, values, solution.predicted.values[0]) if machine else ()
-    residuals = misfit.split(misfit.of(solution.predicted))
+    residuals = misfit.split(misfit.difference(solution.predicted))
     summaries: dict[str, Any] = {}
     for observed, part, sigma in zip(observations, residuals, uncertainties.scales, strict=True):
         summaries |= observed.summary(part, sigma)
@@ -320,7 +320,7 @@ def _mesh(
     expected_order = CONTACT_ORDER if any(probe.moved for probe in runs.problem.scene.probes) else 2.0
 
     def shift_between(coarse: Prediction, fine: Prediction) -> Array:
-        rows = misfit.row(coarse) - misfit.row(fine)
+        rows = misfit.vector(coarse) - misfit.vector(fine)
         return np.abs(uncertainties.shift(misfit.scaled(rows, uncertainties.scales)))
 
     shifts, order = shift_between(half_mesh, solution.predicted), np.full(len(solution.x), expected_order)

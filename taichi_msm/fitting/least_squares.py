@@ -61,13 +61,13 @@ class Misfit:
         self.count = [int(known.sum()) for known in self._known]  # of each observation
         self._observed = self._flatten([observed.values for observed in observations])
 
-    def row(self, predicted: Prediction) -> Array:
+    def vector(self, predicted: Prediction) -> Array:
         """Return the predictions of all known values as a vector, shape (known,)."""
         return self._flatten(predicted.values)
 
-    def of(self, predicted: Prediction) -> Array:
+    def difference(self, predicted: Prediction) -> Array:
         """Return predicted minus observed values, in the units of the observations, shape (known,)."""
-        return self.row(predicted) - self._observed
+        return self.vector(predicted) - self._observed
 
     def split(self, rows: Array) -> list[Array]:
         """Split rows, shape (known, ...), by observation."""
@@ -90,7 +90,7 @@ class Misfit:
             predicted: prediction of all observations.
             scales: standard deviations of the observations.
         """
-        return self.scaled(self.of(predicted), scales)
+        return self.scaled(self.difference(predicted), scales)
 
     def robust_factor(self, residuals: Array) -> Array:
         """Return d; the derivatives of rho / 2 by r are r d^(-1/2) and d^(-3/2)."""
@@ -109,7 +109,7 @@ class Misfit:
             parameters: number of parameters, for the degrees of freedom.
         """
         deviations = []
-        for residuals, signal in zip(self.split(self.of(predicted)), self.signals, strict=True):
+        for residuals, signal in zip(self.split(self.difference(predicted)), self.signals, strict=True):
             mean_square = np.sum(residuals**2) / max(1, len(residuals) - parameters)
             # 1.4826 converts the median magnitude of normal errors to sigma.
             sigma = 1.4826 * np.median(np.abs(residuals)) if self.robust else np.sqrt(mean_square)
@@ -162,7 +162,7 @@ class Search:
     def fits_well(self, solution: Solution) -> bool:
         """Return whether the residuals of all observations are small."""
         misfit = self._misfit
-        residuals = misfit.split(misfit.of(solution.predicted))
+        residuals = misfit.split(misfit.difference(solution.predicted))
         deviations = misfit.deviations(solution.predicted, len(solution.x))
         each = zip(misfit.observations, residuals, deviations, misfit.signals, strict=True)
         return all(observed.fits_well(part, deviation, signal) for observed, part, deviation, signal in each)
@@ -262,7 +262,7 @@ class Search:
                 remedy = "give --bounds or another start by --set"
                 raise SceneError([f"{parameter.key}: no run close to its value succeeds; {remedy}"])
             (x_first, first), (x_second, second) = [*points, (x[n], predicted)][:2]
-            columns.append((self._misfit.row(first) - self._misfit.row(second)) / (x_first - x_second))
+            columns.append((self._misfit.vector(first) - self._misfit.vector(second)) / (x_first - x_second))
         return np.stack(columns, axis=1)
 
     def _cost(self, predicted: Prediction, scales: Scales) -> float:

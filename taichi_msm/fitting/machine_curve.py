@@ -283,8 +283,8 @@ def search_by_curve(runs: CurveRuns, misfit: Misfit, start: Array, first: Predic
 
 def _scale_stiffnesses(runs: CurveRuns, misfit: Misfit, x: Array, initial: Prediction) -> Array:
     """Scale the stiffnesses of x by the ratio of measured to `initial` forces."""
-    predicted = misfit.row(initial)
-    measured = predicted - misfit.of(initial)
+    predicted = misfit.vector(initial)
+    measured = predicted - misfit.difference(initial)
     ratio = np.linalg.norm(measured) / max(float(np.linalg.norm(predicted)), 1e-300)
     names = ("young", "foundation", "structural")
     is_stiffness = [parameter.is_log and parameter.path[-1] in names for parameter in runs.problem.parameters]
