@@ -171,7 +171,7 @@ def view(
 
 
 def _film_path(record: str) -> Path:
-    """Return the path of a film, after checking its format."""
+    """Check the format of a film; return its path."""
     from taichi_msm.scene.outputs import PYAV_NOT_INSTALLED, is_pyav_installed
 
     path = Path(record)
@@ -186,7 +186,7 @@ def _film_path(record: str) -> Path:
 
 
 def _require_origin(url: str) -> str:
-    """Return a URL as browsers write it as an origin."""
+    """Return the origin of a URL, in the spelling of browsers."""
     from urllib.parse import urlsplit
 
     origin = url.rstrip("/").lower()

@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from taichi_msm.sweeps.spec import Sweep
     from taichi_msm.sweeps.tables import SweepCost
 
-# More runs need the option --yes.
+# Largest number of runs without the option --yes.
 MAX_UNCONFIRMED_RUNS = 10_000
 
 
@@ -91,7 +91,7 @@ def sweep(
 
 
 def _print_dry_run(loaded: Sweep, cost: SweepCost, shard: tuple[int, int], workers: int | None, as_json: bool) -> None:
-    """Print the values of the runs of a shard, and their part of the cost of the sweep, as a table or as JSON."""
+    """Print the values and the cost of the runs of a shard, as a table or as JSON."""
     from taichi_msm.sweeps.spec import format_override
     from taichi_msm.sweeps.tables import choose_worker_count, cost_line, csv_line
 
