@@ -123,7 +123,7 @@ def view(
     from taichi_msm.load.scene_file import load_scene
 
     if seconds is not None and record is None:
-        raise click.UsageError("--seconds N goes with --record FILE")
+        raise click.UsageError("--seconds N needs --record FILE")
     if script is not None and seconds is None:
         raise click.UsageError("--script needs --record FILE and --seconds N; otherwise you press with the mouse")
     if (port or origins) and seconds is not None:
@@ -176,7 +176,7 @@ def _film_path(record: str) -> Path:
 
     path = Path(record)
     if path.suffix.lower() not in (".gif", ".mp4"):
-        message = f"{record} is not the name of a GIF or MP4; let it end in .gif or .mp4"
+        message = f"{record} is not a GIF or MP4; take a name with .gif or .mp4"
         raise click.BadParameter(message, param_hint="--record")
     if path.suffix.lower() == ".mp4" and not is_pyav_installed():
         raise NotInstalledError(f"--record {record}: {PYAV_NOT_INSTALLED}")

@@ -56,7 +56,7 @@ def sweep(
         _print_dry_run(loaded, cost, shard or (1, 1), workers, as_json)
         return common.DONE
     if not yes and (loaded.runs > MAX_UNCONFIRMED_RUNS or cost.seconds > 86400):
-        raise click.UsageError(f"{cost_line(loaded.runs, cost, chosen)}; add --yes if that is meant")
+        raise click.UsageError(f"{cost_line(loaded.runs, cost, chosen)}; add --yes to start them")
     state = begin_sweep(loaded, directory, shard or (1, 1))
     outcomes, missing = state.outcomes, len(state.missing)
     total = len(outcomes) + missing

@@ -379,7 +379,7 @@ def measure_pictures(
     memory = process.available_memory() // 2
     finest = _with_render(scene, **REFERENCE_RENDER)
     if cost.drawing_bytes(finest) > memory:
-        study.notes.append("drawing was not measured: there is no memory for the reference picture")
+        study.notes.append("drawing was not measured: the memory is too small for the reference picture")
         return
     reference = Rasterizer(finest, texture).draw(position)
     drawings, candidates = [], list(render_settings(scene, quick))

@@ -124,7 +124,7 @@ def _figure(study: Study) -> Figure:
 def _recommendation_line(study: Study) -> str:
     settings = [line.strip() for line in study.recommendation() if not line.endswith(":")]
     if study.recommended_points is None and study.best_stepping is None:
-        settings.append(f"no step measured is within the tolerance of {study.tolerance:g}")
+        settings.append(f"no measured step is within the tolerance of {study.tolerance:g}")
     return f"Recommended (ringed where measured): {'; '.join(settings)}" if study.stepping else ""
 
 

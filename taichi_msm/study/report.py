@@ -228,7 +228,7 @@ def _shortfall(study: Study) -> str:
     closest = _best(study.stepping, study.tolerance)
     if closest is None:
         return "No step is recommended: none was measured."
-    reason = f"No step that was measured is within the tolerance of {study.tolerance:g}"
+    reason = f"No measured step is within the tolerance of {study.tolerance:g}"
     if closest.error is None:
         reason += ": all diverged."
     else:

@@ -95,12 +95,12 @@ class Inputs(WorkerPlugin):  # type: ignore[misc]  # that package has no types
             return f"worker {worker.address} has {threads} threads; start it with one: dask worker --nthreads 1"
         # Results in a worker's own directory would be lost.
         if not (self.directory / SWEEP_RECORD).is_file():
-            return f"worker {worker.address} does not see {self.directory}; choose an --out that all machines share"
+            return f"worker {worker.address} cannot access {self.directory}; choose an --out that all machines share"
         installed = versions()
         if missing := [
             f"{name} {version}" for name, version in self.versions.items() if installed.get(name) != version
         ]:
-            return f"worker {worker.address} has other versions; install there {', '.join(missing)}"
+            return f"worker {worker.address} needs other versions; install {', '.join(missing)}"
         return ""
 
 
@@ -239,7 +239,7 @@ def _register_inputs(inputs: Inputs, name: str, client: Any) -> None:
         raise
     except Exception as error:
         # Unpickling raises an arbitrary error if a worker lacks a package.
-        raise ExecutorError(f"a worker cannot take runs: {error}; install the same packages there") from None
+        raise ExecutorError(f"a worker cannot execute runs: {error}; install the same packages there") from None
 
 
 def _wait_for_worker(client: Any, progress: StageProgressCallback) -> None:

@@ -111,7 +111,7 @@ class Distribution(Section):
         try:
             json.dumps(value, allow_nan=False)
         except ValueError:
-            raise scene_fault(f"{format_value(value)} has a number that is not finite; take others") from None
+            raise scene_fault(f"{format_value(value)} has an infinite number or NaN; take finite ones") from None
         return value
 
     @model_validator(mode="after")
@@ -232,7 +232,7 @@ class SweepSettings(Section):
                 or keyword.iskeyword(name)
                 or not re.fullmatch(r"[A-Za-z_]\w*", name, re.A)
             ):
-                raise scene_fault("is not a name of a variable; take letters, digits and _, such as x1", name)
+                raise scene_fault("is not a valid name; take letters, digits and _, such as x1", name)
             for value in distribution.values:
                 if isinstance(value, list) or not _numbers(value):
                     raise scene_fault(

@@ -70,7 +70,7 @@ def write_reports(
                 notes += write(state, written)
             except Exception as error:
                 # A failing report must not discard hours of runs.
-                notes.append(f"{name} could not be made: {type(error).__name__}: {error}")
+                notes.append(f"{name} could not be written: {type(error).__name__}: {error}")
         for path in (state.directory / name for name in REPORT_FILES if name not in written):
             if not path.is_dir():
                 path.unlink(missing_ok=True)
@@ -285,7 +285,7 @@ def summary_lines(
         for note in outcome.notes:
             groups.setdefault(re.sub(r"[0-9.e+-]+", "", note), []).append(f"run {outcome.run:06}: {note}")
     for group in sorted(groups.values(), key=len, reverse=True)[:5]:
-        lines.append(f"{_runs(len(group))} with a note, for example {group[0]}")
+        lines.append(f"{_runs(len(group))} with a warning, for example {group[0]}")
     return [*lines, "without --shard, the same command writes the table" if shard else ", ".join(files), *notes]
 
 

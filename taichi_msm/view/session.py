@@ -407,7 +407,7 @@ class Session:
                 else:
                     self._end_film()
             case "w" if self._material_changed:
-                self.show_notice("no scene repeats a session whose material changed: reset (r), then do it again")
+                self.show_notice("a scene cannot contain a changed material: reset (r) and repeat the session")
             case "w":
                 self.show_notice(f"saved {self._captures.save_scene(self.recorded_scene())}")
             case "i":
@@ -421,7 +421,7 @@ class Session:
         session_tools = [tool for tool in plan.tools if tool.probe == len(self._scene_probes)]
         if any(path_problems(plan.scene, session_tools, plan.grid)):
             raise SceneError(
-                ["this tool cannot be position-controlled: its shaft leads down into the sheet; let it lead up"]
+                ["this tool cannot be position-controlled: its shaft points down into the sheet; turn it up"]
             )
         return plan
 
@@ -510,7 +510,7 @@ class Session:
 
 def _require_usable(scene: Scene, *, play: bool) -> None:
     errors = {
-        "image: missing; a session needs one, name it here or with --image": scene.image is None,
+        "image: missing; a session needs a picture, set it here or with --image": scene.image is None,
         "probes: empty; the tool takes its force from the first probe, add one": not scene.probes,
         "probes: a clamp is not a tool of a session; add a probe with a force": bool(scene.probes)
         and all(probe.clamp is not None for probe in scene.probes),
