@@ -171,8 +171,8 @@ class Study:
         sufficient = [point for point in self.stepping if point.error is not None and point.error <= self.tolerance]
         largest = {point.method: point for point in sorted(sufficient, key=lambda point: point.step)}
         fastest = min((point.seconds.median for point in largest.values()), default=0.0)
-        equal = [point for point in largest.values() if point.seconds.median <= 1.1 * fastest]
-        return min(equal, key=lambda point: point.error or 0.0, default=None)
+        fast = [point for point in largest.values() if point.seconds.median <= 1.1 * fastest]
+        return min(fast, key=lambda point: point.error or 0.0, default=None)
 
     @property
     def best_drawing(self) -> DrawingMeasurement | None:
@@ -181,14 +181,14 @@ class Study:
 
     def best_refinement(self, supersample: int) -> DrawingMeasurement | None:
         """Return the fastest sufficient refinement at a supersampling; None if not measured."""
-        decibels = [
+        candidates = [
             (math.inf if drawing.psnr is None else drawing.psnr, drawing)
             for drawing in self.drawing
             if drawing.supersample == supersample
         ]
         # A refinement is sufficient within 0.1 dB of the best.
-        min_psnr = max((psnr for psnr, _ in decibels), default=0.0) - 0.1
-        sufficient = [drawing for psnr, drawing in decibels if psnr >= min_psnr]
+        min_psnr = max((psnr for psnr, _ in candidates), default=0.0) - 0.1
+        sufficient = [drawing for psnr, drawing in candidates if psnr >= min_psnr]
         return min(sufficient, key=lambda drawing: drawing.seconds.median, default=None)
 
     def recommendation(self) -> list[str]:
