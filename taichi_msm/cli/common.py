@@ -22,7 +22,7 @@ EXIT_CODES = {"complete": DONE, "diverged": DIVERGED}
 
 
 def result_directory(out: str | None, default: str = "", option: str = "--out") -> Path:
-    """Return the directory of results that the user gave, or a default one in output/.
+    """Return the directory of results: the value of an option, or a default in output/.
 
     Args:
         out: value of the option; None if it is not given.
@@ -30,8 +30,8 @@ def result_directory(out: str | None, default: str = "", option: str = "--out") 
         option: name of the option, for messages.
 
     Raises:
-        click.BadParameter: when the value is empty, or the default is no name of a directory.
-        FilesError: when the default directory is reached by a symbolic link.
+        click.BadParameter: when the value is empty, or the default is not the name of a directory.
+        FilesError: when the path of the default directory has a symbolic link.
     """
     if out == "":
         raise click.BadParameter("is empty; name a directory", param_hint=option)
@@ -53,17 +53,17 @@ def resume_hint(directory: Path) -> str:
 
 @contextmanager
 def add_resume_hint(directory: Path) -> Iterator[None]:
-    """Append the command that continues an unfinished run to file errors."""
+    """Append the hint of `resume_hint` to file errors of the block."""
     try:
         yield
     except FilesError as error:
-        # Resuming helps if a file could not be written, but not if it is damaged or locked.
+        # A resumed run can help after a failed write, but not with a damaged or locked file.
         raise FilesError(f"{error}{resume_hint(directory) if isinstance(error.__cause__, OSError) else ''}") from None
 
 
 @contextmanager
 def prefix_errors(scene: str) -> Iterator[None]:
-    """Prefix scene errors with the name of the scene, as loading it does."""
+    """Prefix scene errors with the name of the scene, like the errors of loading."""
     try:
         yield
     except SceneError as error:
@@ -75,7 +75,7 @@ def show_progress(interruption: Interruption, quiet: bool) -> Iterator[Callable[
     """Show the progress of the block.
 
     Args:
-        interruption: is listened to from the first stage on.
+        interruption: signal handler, active from the first stage.
         quiet: whether to show nothing.
 
     Yields:
@@ -86,7 +86,7 @@ def show_progress(interruption: Interruption, quiet: bool) -> Iterator[Callable[
 
     def progress(stage: str, done: int, total: int) -> None:
         bar.update(stage, done, total)
-        # Before the first stage, a signal may end the process at once. The publication of results is not interrupted.
+        # Before the first stage, a signal ends the process at once; the stage "write" is never interrupted.
         interruption.listen()
         if stage != "write":
             interruption.raise_if_requested()
@@ -100,7 +100,7 @@ def report_interruption(interruption: Interruption, as_json: bool, rest: Callabl
     """Report an interruption of the block, and exit.
 
     Args:
-        interruption: has the exit code.
+        interruption: interruption with the exit code.
         as_json: whether to print the message as JSON, too.
         rest: returns the end of the message.
 
@@ -108,7 +108,7 @@ def report_interruption(interruption: Interruption, as_json: bool, rest: Callabl
         None, once.
 
     Raises:
-        click.exceptions.Exit: in place of a KeyboardInterrupt of the block.
+        click.exceptions.Exit: after a KeyboardInterrupt of the block, which it replaces.
     """
     try:
         yield

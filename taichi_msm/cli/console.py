@@ -33,7 +33,7 @@ STAGES = {
     "workers": "waiting for a worker of the cluster",
     "runs": "running",
     "fit": "fitting",
-    "contact": "drawing the last frames",
+    "contact": "drawing the contact sheet",
 }
 
 LINE_INTERVAL_S = 10.0
@@ -95,7 +95,7 @@ class _Pace:
         self._last = now
 
     def remaining_s(self, done: int, total: int, now: float) -> float | None:
-        """Estimate the remaining time of the stage; None if it is unknown, or finished."""
+        """Estimate the remaining time of the stage [s]; None if unknown or finished."""
         if done > self.done:
             self._last, self.done = now, done
         if done == self._initially_done or done >= total:
@@ -116,8 +116,8 @@ def run_summary(record: Mapping[str, Any], directory: Path) -> str:
     """Summarise a run in a few lines: frames, steps, forces, warnings and timings.
 
     Args:
-        record: content of its run.json.
-        directory: of its results.
+        record: content of run.json.
+        directory: directory of the results.
 
     Returns:
         Lines for the terminal, as one text.

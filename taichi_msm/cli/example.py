@@ -45,7 +45,7 @@ def example(name: str | None, directory: str) -> None:
 
 
 def scenes_folder() -> Path:
-    """Return the folder of the shipped scenes: in a wheel within the package, in a source tree next to it."""
+    """Return the folder of the shipped scenes: within the package of a wheel, or next to that of a source tree."""
     package = Path(__file__).parent.parent
     return next(folder for folder in (package / "scenes", package.parent / "scenes") if folder.is_dir())
 
@@ -63,7 +63,7 @@ def _summary(path: Path) -> str:
 
 
 def _files(path: Path) -> Iterator[Path]:
-    """Yield a shipped file and the files that it names, also by patterns; those in a scene of a sweep included."""
+    """Yield a shipped file and, recursively, the files whose names or patterns it contains."""
     yield path
     if path.suffix == ".yaml":
         for text in _texts(_content(path)):
@@ -80,7 +80,7 @@ def _texts(value: Any) -> Iterator[str]:
 
 
 def _require_free(path: Path, target: Path, is_scene: bool) -> None:
-    """Raise a FilesError if a file is in the way: any file of the scene's name, or one with other content."""
+    """Raise a FilesError if the target exists; files other than the scene may exist with equal content."""
     with writing(target, "DIR"):
         if target.is_symlink() or (target.exists() and (is_scene or target.read_bytes() != path.read_bytes())):
             raise FilesError(f"{target}: exists already; move it away or choose another DIR")

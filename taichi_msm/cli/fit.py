@@ -63,7 +63,7 @@ def fit(
     from taichi_msm.fitting.machine_model import is_table
     from taichi_msm.load.scene_file import load_scene
 
-    # Both options accept several words, of which click assigns all but the first to `more`; so does OBSERVED.
+    # --free, --bounds and OBSERVED accept several words; click assigns all but the first to `more`.
     tables = [observed, *(word for word in more if is_table(word))]
     more = tuple(word for word in more if not is_table(word))
     limits: dict[str, tuple[float, float]] = {}

@@ -15,10 +15,7 @@ from taichi_msm.system.process import discard_buffer, write_stderr
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run a command, by default that of sys.argv, and return its exit code.
-
-    The codes are those of common.py, 130 after Ctrl-C and 143 after SIGTERM.
-    """
+    """Run a command, by default that of sys.argv; return an exit code of `common`, 130 (Ctrl-C) or 143 (SIGTERM)."""
     words = list(sys.argv[1:] if arguments is None else arguments)
     try:
         code, lines = _run(words)
@@ -43,7 +40,7 @@ def _run(words: list[str]) -> tuple[int, Sequence[str]]:
     try:
         return int(options.program.main(words, prog_name="taichi-msm", standalone_mode=False) or common.DONE), ()
     except SystemExit:
-        # click exits like this when the reader of stdout has exited.
+        # click raises SystemExit when the reader of stdout has exited.
         raise BrokenPipeError from None
     except SceneError as error:
         return common.INVALID_INPUT, error.lines

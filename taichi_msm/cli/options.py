@@ -21,7 +21,7 @@ class SuggestingChoice(click.Choice):  # type: ignore[type-arg]  # not generic b
         Args:
             value: the word.
             param: the option, for messages.
-            ctx: of the command, for messages.
+            ctx: context of the command, for messages.
 
         Returns:
             The word.

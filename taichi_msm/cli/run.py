@@ -116,7 +116,7 @@ def run(
 
 
 def _require_no_settings(context: click.Context, action: str, allowed: Sequence[str]) -> None:
-    """Reject other options than the allowed ones next to one that reuses the settings of an earlier run."""
+    """Reject all but the allowed options of a command that reuses the settings of an earlier run."""
     for option in context.command.params:
         is_given = context.get_parameter_source(str(option.name)) is click.core.ParameterSource.COMMANDLINE
         if is_given and option.name not in allowed:
@@ -198,7 +198,7 @@ def check(scene: str, image: str | None, overrides: tuple[str, ...], as_json: bo
 
 
 def _lock_cost(plan: Plan) -> str:
-    """Describe the cost of tissue that locks; return an empty string without it."""
+    """Describe the shorter step of tissue that locks; an empty string for other tissue."""
     if plan.material.stiffening is None and plan.material.virtual_stiffening is None:
         return ""
     from taichi_msm.solver.planning import stable_step

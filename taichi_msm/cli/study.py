@@ -123,7 +123,7 @@ def view(
     from taichi_msm.load.scene_file import load_scene
 
     if seconds is not None and record is None:
-        raise click.UsageError("--seconds N goes with --record FILE")
+        raise click.UsageError("--seconds N needs --record FILE")
     if script is not None and seconds is None:
         raise click.UsageError("--script needs --record FILE and --seconds N; otherwise you press with the mouse")
     if (port or origins) and seconds is not None:
@@ -171,12 +171,12 @@ def view(
 
 
 def _film_path(record: str) -> Path:
-    """Return the path of a film, after checking its format."""
+    """Check the format of a film; return its path."""
     from taichi_msm.scene.outputs import PYAV_NOT_INSTALLED, is_pyav_installed
 
     path = Path(record)
     if path.suffix.lower() not in (".gif", ".mp4"):
-        message = f"{record} is not the name of a GIF or MP4; let it end in .gif or .mp4"
+        message = f"{record} is not a GIF or MP4; take a name with .gif or .mp4"
         raise click.BadParameter(message, param_hint="--record")
     if path.suffix.lower() == ".mp4" and not is_pyav_installed():
         raise NotInstalledError(f"--record {record}: {PYAV_NOT_INSTALLED}")
@@ -186,7 +186,7 @@ def _film_path(record: str) -> Path:
 
 
 def _require_origin(url: str) -> str:
-    """Return a URL as browsers write it as an origin."""
+    """Return the origin of a URL, in the spelling of browsers."""
     from urllib.parse import urlsplit
 
     origin = url.rstrip("/").lower()

@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from taichi_msm.sweeps.spec import Sweep
     from taichi_msm.sweeps.tables import SweepCost
 
-# More runs need the option --yes.
+# Largest number of runs without the option --yes.
 MAX_UNCONFIRMED_RUNS = 10_000
 
 
@@ -56,7 +56,7 @@ def sweep(
         _print_dry_run(loaded, cost, shard or (1, 1), workers, as_json)
         return common.DONE
     if not yes and (loaded.runs > MAX_UNCONFIRMED_RUNS or cost.seconds > 86400):
-        raise click.UsageError(f"{cost_line(loaded.runs, cost, chosen)}; add --yes if that is meant")
+        raise click.UsageError(f"{cost_line(loaded.runs, cost, chosen)}; add --yes to start them")
     state = begin_sweep(loaded, directory, shard or (1, 1))
     outcomes, missing = state.outcomes, len(state.missing)
     total = len(outcomes) + missing
@@ -91,7 +91,7 @@ def sweep(
 
 
 def _print_dry_run(loaded: Sweep, cost: SweepCost, shard: tuple[int, int], workers: int | None, as_json: bool) -> None:
-    """Print the values of the runs of a shard, and their part of the cost of the sweep, as a table or as JSON."""
+    """Print the values and the cost of the runs of a shard, as a table or as JSON."""
     from taichi_msm.sweeps.spec import format_override
     from taichi_msm.sweeps.tables import choose_worker_count, cost_line, csv_line
 

@@ -8,7 +8,7 @@ from typing import Any
 
 from taichi_msm.study.result import MeshMeasurement, SteppingMeasurement, Study, Timing
 
-# Units of time: number in a second, and name.
+# Units of time: number of units per second, and name.
 TIME_UNITS = ((1, "s"), (1e3, "ms"), (1e6, "us"))
 
 Columns = Mapping[str, Callable[[Any], str]]
@@ -26,7 +26,7 @@ def time_unit(seconds: float) -> tuple[float, str]:
     """Choose a readable unit of time for a duration [s].
 
     Returns:
-        Its number in a second, and its name.
+        Number of units per second, and name of the unit.
     """
     return next(((scale, name) for scale, name in TIME_UNITS if seconds * scale >= 0.9995), TIME_UNITS[-1])
 
@@ -38,7 +38,7 @@ def format_duration(seconds: float) -> str:
 
 
 def format_timing(timing: Timing) -> str:
-    """Format a median and, in the same unit, the range."""
+    """Format a median and its range in one unit."""
     scale, _ = time_unit(timing.median)
     range_text = "once"
     if timing.runs > 1:
@@ -96,7 +96,7 @@ def format_table(measurements: Sequence[Any], columns: Columns, remark: Callable
     Args:
         measurements: measurements of one kind.
         columns: format functions of the cells, by the name of the column.
-        remark: format function of a last column without a name, which is omitted if all its cells are empty.
+        remark: format function of an unnamed last column, omitted if all its cells are empty.
 
     Returns:
         The table, without a final line break.

@@ -57,10 +57,10 @@ class SteppingStudy:
     """Work-precision diagram of stepping.
 
     Args:
-        plan: of the scene.
-        device: runs the simulations.
+        plan: plan of the scene.
+        device: device of the simulations.
         longest_run: approximate time limit of a run [s].
-        study: receives the results, also those before a KeyboardInterrupt from `progress`.
+        study: receives the results, with those before a KeyboardInterrupt from `progress`.
         progress: called with the number of finished runs and their total.
     """
 
@@ -77,7 +77,7 @@ class SteppingStudy:
         self._done, self._total = 0, 1
 
     def run(self) -> Array:
-        """Compute the reference and the errors, then repeat all runs for their times.
+        """Compute the reference and the errors, then repeat all runs to measure their times.
 
         Returns:
             Reference displacements at every frame but the first [m], shape (F, rows, cols, 3).
@@ -103,7 +103,7 @@ class SteppingStudy:
         return frames
 
     def _series(self, difference: str) -> Iterator[int]:
-        """Yield the steps per frame, from that of the largest valid step, doubled until a run would take too long."""
+        """Yield the steps per frame: the smallest valid number, then its doubles up to the time limit of a run."""
         steps = min_steps_per_frame(self._plan.tools, self._plan.grid, stable_steps(self._plans[difference]))
         samples: list[float] = []
         self._run("f64", difference, steps, samples)
@@ -116,8 +116,8 @@ class SteppingStudy:
 
     def _compute_reference(self, finest: int) -> Array:
         """Extrapolate central differences with one half and one quarter of the finest measured step."""
-        # u* = u_{h/2} + (u_{h/2} - u_h) / 3. Its error is at most about its distance from the same formula with 2 h for
-        # h. With contact, of order 1, the finest run is the reference.
+        # u* = u_{h/2} + (u_{h/2} - u_h) / 3. The distance of u* from the same formula at 2 h bounds its error, roughly.
+        # Contact is of order 1: the finest run is then the reference.
         coarse, middle, fine = (self._run("f64", "central", finest * 2**halving, []) for halving in range(3))
         before, frames = middle + (middle - coarse) / 3, fine + (fine - middle) / 3
         if self._plan.tools:
@@ -150,7 +150,7 @@ class SteppingStudy:
                         remaining.discard(precision)
 
     def _run(self, precision: str, difference: str, steps: int, samples: list[float]) -> Array:
-        """Simulate the scene, append the time without that of the copies [s] to the samples, and return the frames."""
+        """Simulate the scene, append the time without copies [s] to the samples, and return the frames."""
         dynamics = self._dynamics[precision]
         plan = self._plans[difference].with_grid(precision=precision, steps_per_frame=steps)
         dynamics.restart(plan)
@@ -185,12 +185,11 @@ class _MeshRun(NamedTuple):
 class MeshStudy:
     """Work-precision diagram of the mesh of a sheet of tissue, in f64.
 
-    Errors are measured with the same step for all meshes, so that the time-step errors cancel. Times are measured with
-    the automatic step of each mesh, which is longer for coarser ones.
+    Errors are measured with one step for all meshes, so that the time-step errors cancel; times with the automatic step
+    of each mesh, which is longer for coarser ones.
 
-    The reference is a mesh finer than all measured ones if there is time for it: a single run, which may take as long
-    as all timed runs of another mesh. Otherwise it is the finest measured mesh, for whose own error only a bound is
-    known.
+    The reference has a mesh finer than all measured ones, if one run of it takes at most the time limit of all timed
+    runs of a mesh. Otherwise it ends at the finest measured mesh, whose own error is then only a bound.
 
     Args:
         plan: of the scene.
@@ -210,10 +209,7 @@ class MeshStudy:
         self._done = 0
 
     def run(self) -> None:
-        """Compute the errors, then measure the times.
-
-        Sheets of springs are skipped, as their stiffness depends on the mesh.
-        """
+        """Compute the errors, then measure the times; skip sheets of springs, whose stiffness depends on the mesh."""
         if self._plan.scene.tissue is None:
             return
         with ExitStack() as opened:
@@ -250,7 +246,7 @@ class MeshStudy:
         return min(self._step_through(sheet) for _ in range(2))
 
     def _finer_plan(self, plan: Plan, seconds: float, longest_run: float) -> Plan | None:
-        """Plan the next finer mesh than one that took `seconds`; return None beyond the limits of time or memory."""
+        """Plan the next finer mesh after one that took `seconds`; None beyond the limit of points, time or memory."""
         points = _scaled(plan, FINE_CELL_RATIO)
         if max(points) > MAX_POINTS:
             return None
@@ -278,8 +274,8 @@ class MeshStudy:
                 with np.errstate(all="ignore"):
                     exact, bound = _reference(fields, extrapolate=not finest.tools)
                     frame_errors = [max_norm(interpolate(field, exact) - exact) for field in fields[:-1]]
-                    # The error of the finest mesh is unknown between its mass points. But at an order of at least 1,
-                    # it is at most the distance from a mesh with half the cells per side.
+                    # The error of the finest mesh between its mass points is unknown. At an order of at least 1, the
+                    # distance from a mesh with half the cells per side bounds it.
                     frame_errors.append(max_norm(interpolate(fields[-2], fields[-1]) - fields[-1]))
                 errors = [max(pair) for pair in zip(errors, frame_errors, strict=True)]
                 reference_error, largest = max(reference_error, bound), max(largest, max_norm(exact))
@@ -295,7 +291,7 @@ class MeshStudy:
             measurement.error = share if share < math.inf else None
 
     def _step_through(self, sheet: _MeshRun) -> float:
-        """Simulate the scene with the automatic step; return the time of the steps alone [s]."""
+        """Simulate the scene with the automatic step; return the time of the steps [s]."""
         plan, dynamics, _ = sheet
         dynamics.restart(plan)
         seconds = 0.0
@@ -308,12 +304,12 @@ class MeshStudy:
         return seconds
 
     def _tick(self) -> None:
-        # Two first runs of every mesh and the timed ones; the comparison of all meshes counts as one.
+        # Per mesh two first runs and `ROUNDS` timed ones; the comparison of all meshes counts as one run.
         self._progress(self._done, 1 + (2 + ROUNDS) * len(self._sheets))
 
 
 def mesh_plans(plan: Plan) -> Iterator[Plan]:
-    """Yield the plans of the meshes that the scene allows, from coarse to its own."""
+    """Yield the plans of valid coarser meshes, from coarse to fine, then that of the scene's own mesh."""
     for ratio in (1 / 4, 1 / 2):
         points = _scaled(plan, ratio)
         coarse, _ = (
@@ -332,11 +328,11 @@ def _scaled(plan: Plan, ratio: float) -> tuple[int, int]:
 
 
 def _reference(fields: list[Array], *, extrapolate: bool) -> tuple[Array, float]:
-    """Apply Richardson's extrapolation of order 2 to the two finest fields; return it and a bound of its error [m]."""
+    """Return Richardson's extrapolation of order 2 of the two finest fields, and a bound of its error [m]."""
     # u* = u + (u - u_r) / (r^2 - 1), where u_r has cells r times as long. The correction is computed at the mass points
-    # of u_r and interpolated at those of u. The error of u* is at most about its distance from the extrapolation of the
-    # next coarser pair, or from u if there are only two fields. With contact, of order 1, u is not extrapolated; its
-    # error is at most about its distance from u_r.
+    # of u_r and interpolated at those of u. The rough bound is the distance of u* from the extrapolation of the next
+    # coarser pair, or from u if there are only two fields. Contact is of order 1: u is then the reference, and its
+    # distance from u_r the rough bound.
     if not extrapolate:
         return fields[-1], max_norm(interpolate(fields[-1], fields[-2]) - fields[-2])
     exact = fields[-1] + interpolate(_correction(fields[-1], fields[-2]), fields[-1])
@@ -373,9 +369,9 @@ def measure_pictures(
 
     Args:
         scene: the scene.
-        position: of the mass points [m], shape (rows, cols, 3).
+        position: positions of the mass points [m], shape (rows, cols, 3).
         texture: picture on the sheet, 8-bit RGB, shape (height, width, 3).
-        quick: as for `render_settings`.
+        quick: whether to vary only one of refinement and supersampling at a time.
         study: receives the results.
         progress: called with the number of finished pictures and their total.
     """
@@ -383,7 +379,7 @@ def measure_pictures(
     memory = process.available_memory() // 2
     finest = _with_render(scene, **REFERENCE_RENDER)
     if cost.drawing_bytes(finest) > memory:
-        study.notes.append("drawing was not measured: there is no memory for the reference picture")
+        study.notes.append("drawing was not measured: the memory is too small for the reference picture")
         return
     reference = Rasterizer(finest, texture).draw(position)
     drawings, candidates = [], list(render_settings(scene, quick))
@@ -411,8 +407,8 @@ def render_settings(scene: Scene, quick: bool) -> Iterator[tuple[int, int]]:
     """Yield the pairs of refinement and supersampling to compare.
 
     Args:
-        scene: has its own settings.
-        quick: whether to vary one of both at a time.
+        scene: scene whose own settings are included.
+        quick: whether to vary only one of the two at a time.
     """
     render = scene.render
     for supersample in sorted({*SUPERSAMPLES, render.supersample}):
@@ -436,5 +432,5 @@ def psnr(picture: Picture, reference: Picture) -> float | None:
 
 
 def _with_render(scene: Scene, **changes: int) -> Scene:
-    # Not validated, as the settings of the reference picture exceed the limits of a scene.
+    # No validation: the settings of the reference picture exceed the limits of a scene.
     return scene.model_copy(update={"render": BaseModel.model_copy(scene.render, update=changes)})

@@ -124,7 +124,7 @@ def _figure(study: Study) -> Figure:
 def _recommendation_line(study: Study) -> str:
     settings = [line.strip() for line in study.recommendation() if not line.endswith(":")]
     if study.recommended_points is None and study.best_stepping is None:
-        settings.append(f"no step measured is within the tolerance of {study.tolerance:g}")
+        settings.append(f"no measured step is within the tolerance of {study.tolerance:g}")
     return f"Recommended (ringed where measured): {'; '.join(settings)}" if study.stepping else ""
 
 
@@ -247,14 +247,14 @@ def _scale(axes: Axes, axis: str, values: Iterable[float], min_decades: float) -
     axes.set(**{f"{axis}scale": "log", f"{axis}lim": (10 ** (low - margin), 10 ** (high + margin))})
     ticks: Axis = getattr(axes, f"{axis}axis")
     if axis == "y":
-        # 0.05 rather than 5 x 10^-2.
+        # Format 0.05, not 5 x 10^-2.
         ticks.set_major_locator(LogLocator(subs=(1, 2, 5) if high - low + 2 * margin < 2.5 else (1,)))
         ticks.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
     ticks.set_minor_formatter(NullFormatter())
 
 
 def _legend(axes: Axes, handles: Sequence[Line2D], columns: int = 2) -> None:
-    """Add a legend below a panel and its label, as wide as the panel."""
+    """Add a legend of the panel's width below the panel and its label."""
     figure = axes.figure
     assert isinstance(figure, Figure)
     axes.legend(

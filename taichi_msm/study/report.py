@@ -53,8 +53,8 @@ def write_report(study: Study, directory: Path) -> list[str]:
     Every file is written atomically, study.json last.
 
     Args:
-        study: the results; gets a note if the figure cannot be plotted.
-        directory: of the report.
+        study: the results; receives a note if the figure cannot be plotted.
+        directory: directory of the report.
 
     Returns:
         Names of the files, study.json last.
@@ -66,7 +66,7 @@ def write_report(study: Study, directory: Path) -> list[str]:
         outputs = [*([PICTURE_FILE] if _draw(study, hidden / PICTURE_FILE) else []), PAGE_FILE, RECORD_FILE]
         record = json.dumps({**study_record(study), "outputs": outputs}, indent=2, ensure_ascii=False, allow_nan=False)
         for file, text in ((PAGE_FILE, format_page(study)), (RECORD_FILE, record + "\n")):
-            # Surrogates, of a file name that is not UTF-8, become backslash escapes, which are valid in JSON too.
+            # File names that are not UTF-8 get backslash escapes, which are also valid in JSON.
             (hidden / file).write_text(text, encoding="utf-8", errors="backslashreplace", newline="")
         if PICTURE_FILE not in outputs:
             (directory / PICTURE_FILE).unlink(missing_ok=True)
@@ -228,7 +228,7 @@ def _shortfall(study: Study) -> str:
     closest = _best(study.stepping, study.tolerance)
     if closest is None:
         return "No step is recommended: none was measured."
-    reason = f"No step that was measured is within the tolerance of {study.tolerance:g}"
+    reason = f"No measured step is within the tolerance of {study.tolerance:g}"
     if closest.error is None:
         reason += ": all diverged."
     else:

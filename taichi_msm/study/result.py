@@ -32,8 +32,8 @@ class Timing:
 class Reference:
     """Reference solution for the errors of stepping: central differences in f64, extrapolated."""
 
-    steps_per_frame: int  # of its finest run
-    error: float  # of the reference itself, estimated by halving the step, as a fraction of the largest displacement
+    steps_per_frame: int  # of the finest run
+    error: float  # estimated error of the reference, as a fraction of the largest displacement
     largest: float  # largest displacement of any mass point at any frame [m]
 
 
@@ -59,8 +59,8 @@ class SteppingMeasurement(Measurement):
     step: float  # time step h [s]
     # Largest error of any mass point at any frame, as a fraction of the largest displacement; None if it diverged.
     error: float | None = None
-    rounding: float | None = None  # difference from f64 with the same step, the same fraction; None if not known
-    known: bool = False  # whether the reference is accurate enough for this error; otherwise it is an approximate bound
+    rounding: float | None = None  # difference from f64 at equal step, as the same fraction; None if unknown
+    known: bool = False  # whether the reference is accurate enough for `error`; otherwise `error` is a rough bound
 
     @property
     def method(self) -> str:
@@ -103,15 +103,15 @@ class Study:
     status: str  # complete or interrupted
     tolerance: float  # largest allowed error, as a fraction of the largest displacement
     machine: dict[str, Any]  # CPU, cores, arch, threads, bits of a vector, and versions
-    reference: Reference | None = None  # None if the study was interrupted before it was computed
+    reference: Reference | None = None  # None if the study was interrupted earlier
     stepping: list[SteppingMeasurement] = field(default_factory=list)  # by method and then by decreasing step
-    orders: dict[str, float | None] = field(default_factory=dict)  # of convergence, as from `observed_orders`
+    orders: dict[str, float | None] = field(default_factory=dict)  # orders of convergence by method
     drawing: list[DrawingMeasurement] = field(default_factory=list)  # by supersampling and refinement
     points: list[MeshMeasurement] = field(default_factory=list)  # from coarse to fine; empty for springs
     notes: list[str] = field(default_factory=list)  # remarks for the reader, such as omitted parts and the reason
 
     def finish(self) -> None:
-        """Remove measurements without timings, sort those of stepping, and fit the orders of convergence."""
+        """Remove measurements without timings, sort the steppings, and fit the orders of convergence."""
         self.stepping = sorted(
             (point for point in self.stepping if point.samples),
             key=lambda point: (point.precision, point.damping_difference != "central", point.steps_per_frame),
@@ -138,10 +138,10 @@ class Study:
 
     @property
     def recommended_points(self) -> tuple[int, int] | None:
-        """Rows and columns of mass points with an error within the tolerance; None if the scene's own mesh suffices.
+        """Rows and columns of a mesh within the tolerance; None if the scene's mesh is sufficient or was not measured.
 
-        This is the coarsest sufficient mesh that was measured, otherwise an extrapolation with the order of convergence
-        of the two finest meshes, limited to 1 to 2. It may be finer than a scene allows.
+        The mesh is the coarsest sufficient one of the measurements; otherwise it is extrapolated with the observed
+        order of convergence, limited to 1 to 2, and may be finer than a scene allows.
         """
         scene_mesh, allowed = self.scene_mesh, self.mesh_tolerance
         if scene_mesh is None or scene_mesh.error is None or scene_mesh.error <= allowed:
@@ -161,18 +161,18 @@ class Study:
 
     @property
     def best_stepping(self) -> SteppingMeasurement | None:
-        """Fastest stepping within the tolerance, or the most accurate of those within 10 % of its time.
+        """Most accurate stepping within the tolerance that takes at most 10 % more time than the fastest.
 
-        None if there is none, or if the scene needs another mesh, for which no step was measured. Only the largest step
-        of every method is considered, as timing noise could favour a smaller one.
+        None if there is none, or if the scene needs another mesh, whose steps are not measured. Each method has only
+        its largest step as a candidate: timing noise could favour a smaller one.
         """
         if self.recommended_points is not None:
             return None
         sufficient = [point for point in self.stepping if point.error is not None and point.error <= self.tolerance]
         largest = {point.method: point for point in sorted(sufficient, key=lambda point: point.step)}
         fastest = min((point.seconds.median for point in largest.values()), default=0.0)
-        equal = [point for point in largest.values() if point.seconds.median <= 1.1 * fastest]
-        return min(equal, key=lambda point: point.error or 0.0, default=None)
+        fast = [point for point in largest.values() if point.seconds.median <= 1.1 * fastest]
+        return min(fast, key=lambda point: point.error or 0.0, default=None)
 
     @property
     def best_drawing(self) -> DrawingMeasurement | None:
@@ -181,14 +181,14 @@ class Study:
 
     def best_refinement(self, supersample: int) -> DrawingMeasurement | None:
         """Return the fastest sufficient refinement at a supersampling; None if not measured."""
-        decibels = [
+        candidates = [
             (math.inf if drawing.psnr is None else drawing.psnr, drawing)
             for drawing in self.drawing
             if drawing.supersample == supersample
         ]
-        # Sufficient is a distance of 0.1 dB from the best.
-        min_psnr = max((psnr for psnr, _ in decibels), default=0.0) - 0.1
-        sufficient = [drawing for psnr, drawing in decibels if psnr >= min_psnr]
+        # A refinement is sufficient within 0.1 dB of the best.
+        min_psnr = max((psnr for psnr, _ in candidates), default=0.0) - 0.1
+        sufficient = [drawing for psnr, drawing in candidates if psnr >= min_psnr]
         return min(sufficient, key=lambda drawing: drawing.seconds.median, default=None)
 
     def recommendation(self) -> list[str]:
@@ -208,7 +208,7 @@ class Study:
             if self.settings["time"]["tolerance"] is not None:
                 lines.append("  tolerance: null")
             lines += [
-                # With all digits: rounded up, the largest stable step would exceed the limit.
+                # All digits: a rounded step could exceed the stability limit.
                 f"  step: {step.step!r}",
                 f"  damping_difference: {step.damping_difference}",
                 f"  precision: {step.precision}",
@@ -219,10 +219,10 @@ class Study:
 
 
 def observed_orders(points: list[SteppingMeasurement]) -> dict[str, float | None]:
-    """Fit the order of convergence of every method to the measurements whose error is due to the step.
+    """Fit the order of convergence of every method to its known errors without significant rounding.
 
     Returns:
-        Order by the name of the method; None for fewer than three such measurements.
+        Order by the name of the method; None for fewer than three such errors.
     """
     orders: dict[str, float | None] = {}
     for method in dict.fromkeys(point.method for point in points):

@@ -34,13 +34,13 @@ def run_study(
 
     Args:
         scene: the scene or its plan.
-        name: of the scene, in the report.
-        tolerance: largest allowed error, as a fraction of the largest displacement; by default the scene's, or 1e-3.
+        name: name of the scene in the report.
+        tolerance: largest allowed error, as a fraction of the largest displacement; None for the scene's, or 1e-3.
         quick: whether to measure fewer settings, in about a minute for a small sheet.
         arch: cpu, cuda or vulkan.
         threads: number of CPU threads, by default one per core.
-        progress: called with the stage, the finished part and the total; after a KeyboardInterrupt from it the study
-            returns the results so far.
+        progress: called with the stage, the finished and the total number of runs or pictures; a KeyboardInterrupt from
+            it ends the study with the results so far.
 
     Returns:
         The measurements, without a report.
@@ -65,7 +65,7 @@ def run_study(
     )
     # Approximate time limit of a run of the whole scene [s].
     longest_run = 0.25 if quick else 2.0
-    # The study itself varies the step.
+    # No tolerance: the study varies the step itself.
     plan = choose_precision(plan_variant(plan, with_time(scene, tolerance=None)), device.arch)
     scene = plan.scene
     try:
@@ -98,7 +98,7 @@ def machine_record(device: Device) -> dict[str, Any]:
 
 def _require_memory(scene: Scene) -> None:
     rows, cols = scene.sheet.points
-    # At most six trajectories are in memory: the reference, and those of its extrapolation and comparison.
+    # At most six trajectories: the reference, its extrapolation, and the compared runs.
     needed = 6 * scene.time.frames * rows * cols * 3 * 8
     available = process.available_memory()
     if needed > available:

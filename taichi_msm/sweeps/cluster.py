@@ -39,18 +39,18 @@ class Inputs(WorkerPlugin):  # type: ignore[misc]  # that package has no types
     """Worker plugin with the common inputs of all runs of a sweep.
 
     Args:
-        sweep: its scene and the contents of its files are sent to every worker.
-        directory: of the sweep; workers must have access to it.
+        sweep: sweep with the scene and the files of the runs.
+        directory: directory of the sweep, accessible to all workers.
 
     Attributes:
         versions: required versions of this package and its libraries, by name.
         error: reason why the worker cannot execute runs; empty if it can.
-        copies: local copies of the files, by their paths on the machine where the sweep was started.
+        copies: local copies of the files, by original path.
     """
 
     def __init__(self, sweep: Sweep, directory: Path) -> None:
         scene = sweep.scene
-        # Paths are absolute, as the current directory may not exist on a worker's machine.
+        # Absolute paths do not depend on a worker's current directory.
         self.scene, self.directory = scene._replace(folder=scene.folder.absolute()), directory.absolute()
         self.home = Path.cwd()
         self.versions = result_versions(versions(), "cpu")
@@ -79,7 +79,7 @@ class Inputs(WorkerPlugin):  # type: ignore[misc]  # that package has no types
         self.copies = {path: self._folder / digest for path, digest in self._digests.items()}
 
     def teardown(self, worker: Any) -> None:  # noqa: ARG002
-        """Stop the worker's run, at the end of the worker or the sweep."""
+        """Stop the run of a worker when the worker closes or the sweep ends."""
         self._ended = True
         if self.copies:
             shutil.rmtree(self._folder, ignore_errors=True)
@@ -93,19 +93,19 @@ class Inputs(WorkerPlugin):  # type: ignore[misc]  # that package has no types
         """Return the reason why a worker cannot execute runs, or an empty string."""
         if (threads := worker.state.nthreads) != 1:
             return f"worker {worker.address} has {threads} threads; start it with one: dask worker --nthreads 1"
-        # Results in a directory of the worker itself would be lost.
+        # Results in a worker's own directory would be lost.
         if not (self.directory / SWEEP_RECORD).is_file():
-            return f"worker {worker.address} does not see {self.directory}; choose an --out that all machines share"
+            return f"worker {worker.address} cannot access {self.directory}; choose an --out that all machines share"
         installed = versions()
         if missing := [
             f"{name} {version}" for name, version in self.versions.items() if installed.get(name) != version
         ]:
-            return f"worker {worker.address} has other versions; install there {', '.join(missing)}"
+            return f"worker {worker.address} needs other versions; install {', '.join(missing)}"
         return ""
 
 
 class Cluster(ClientExecutor):  # type: ignore[misc]
-    """Executor for the workers of a scheduler, which sends only the number, overrides and directory of each run.
+    """Executor for the workers of a scheduler; sends only the number, overrides and directory of each run.
 
     Args:
         client: connection to the scheduler.
@@ -120,7 +120,7 @@ class Cluster(ClientExecutor):  # type: ignore[misc]
         """Schedule a call in an idle worker.
 
         Args:
-            function: an importable function; for `execute_run`, inputs that the worker has are not sent.
+            function: an importable function; `execute_run` takes the scene and its files from the plugin `Inputs`.
             arguments: picklable arguments of the function.
 
         Returns:
@@ -140,7 +140,7 @@ class Cluster(ClientExecutor):  # type: ignore[misc]
 
 
 def _call(name: str, function: Callable[..., Any], *arguments: Any) -> Any:
-    """Call a function in a worker, with its local copies of the files."""
+    """Call a function with the worker's local copies of the files."""
     with use_copies(_inputs(name).copies):
         return function(*arguments)
 
@@ -152,7 +152,7 @@ def _execute_run(name: str, run: int, overrides: tuple[str, ...], directory: Pat
         outcome: Outcome = _call(name, execute_run, task, inputs.pause)
         inputs.pause("", 0, 0)
         return outcome
-    # The worker ends; another one must execute the run.
+    # The worker is closing: dask executes the run in another one.
     raise Reschedule
 
 
@@ -170,12 +170,12 @@ def _inputs(name: str) -> Inputs:
 def cluster_connection(
     address: str, sweep: Sweep, directory: Path, progress: StageProgressCallback
 ) -> Iterator[Cluster]:
-    """Connect to a scheduler, and provide its workers with the inputs of a sweep within the block.
+    """Connect to a scheduler and send the inputs of a sweep to its workers; a context manager.
 
     Args:
-        address: of the scheduler, such as tcp://10.0.0.1:8786.
-        sweep: its scene and files are the inputs.
-        directory: of the sweep.
+        address: address of the scheduler, such as tcp://10.0.0.1:8786.
+        sweep: sweep with the scene and the files of the runs.
+        directory: directory of the sweep.
         progress: called while waiting for the first worker.
 
     Yields:
@@ -183,11 +183,11 @@ def cluster_connection(
 
     Raises:
         ExecutorError: when no scheduler answers, or a worker cannot execute runs.
-        LostExecutorError: when the connection is lost within the block, in place of the error of the block.
+        LostExecutorError: when the connection is lost within the block; replaces the error of the block.
     """
     with silence_logging_cmgr(logging.CRITICAL):
         client = _client(address)
-        # With a name per directory, a new command replaces the plugin of a killed one.
+        # One name per directory: a new command replaces the plugin of a killed one.
         name = f"taichi-msm {directory.absolute()}"
         cluster, lost = Cluster(client, name), False
         try:
@@ -195,7 +195,7 @@ def cluster_connection(
             _wait_for_worker(client, progress)
             yield cluster
         except ExecutorError as error:
-            # Within the block, runs are cancelled only by a lost connection.
+            # Only a lost connection cancels runs within the block.
             if lost := isinstance(error.__cause__, (BrokenExecutor, CancelledError, OSError)):
                 raise LostExecutorError(f"lost the scheduler at {address}") from error
             raise
@@ -239,7 +239,7 @@ def _register_inputs(inputs: Inputs, name: str, client: Any) -> None:
         raise
     except Exception as error:
         # Unpickling raises an arbitrary error if a worker lacks a package.
-        raise ExecutorError(f"a worker cannot take runs: {error}; install the same packages there") from None
+        raise ExecutorError(f"a worker cannot execute runs: {error}; install the same packages there") from None
 
 
 def _wait_for_worker(client: Any, progress: StageProgressCallback) -> None:

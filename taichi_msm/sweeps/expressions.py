@@ -1,6 +1,6 @@
 """Expressions of variables in a sweep's `set`: texts that begin with =, such as "=0.5 + x / 2".
 
-They are parsed by `ast` and evaluated node by node; anything that is not listed here is an error. Powers are computed
+`ast` parses them, and `_value` evaluates the kinds of nodes that it lists; all others are errors. Powers are computed
 as floats, so that 9**9**9 overflows at once.
 """
 
@@ -54,10 +54,10 @@ def evaluate(text: str, variables: Mapping[str, float]) -> float:
 
     Args:
         text: the expression, with = at its beginning.
-        variables: values by name. With NaN the result is NaN, or an error that does not depend on the value.
+        variables: values by name; with NaN, only errors that do not depend on values are raised.
 
     Returns:
-        The value, an int where all numbers in the expression are ints and it has no division.
+        The value; an int if the expression has only ints and no division.
 
     Raises:
         ExpressionError: when the expression is invalid, or its value is not defined or too large.
@@ -109,8 +109,8 @@ def replace_expressions(value: Any, change: Callable[[Key, str], Any], path: Key
 
     Args:
         value: plain data.
-        change: function from the path below the value and the expression to its replacement.
-        path: path to the value.
+        change: function of the key and the text of an expression; returns the replacement.
+        path: key of the value.
     """
     if isinstance(value, str):
         return change(path, value) if value.startswith("=") else value

@@ -4,12 +4,12 @@ The first-order sensitivity index is the share of a result's variance explained 
 
 Source: Plischke, "An effective algorithm for computing global sensitivity indices (EASI)", 2010, and Tissot and Prieur,
 "Bias correction for the estimation of sensitivity indices based on random balance designs", 2012; both as RBD-FAST of
-SALib. The method sorts the results by one parameter, and assumes that the others are then in random order. In Sobol
-points and grids they are not: neighbours in one coordinate alternate between low and high values of another. Therefore
-neighbours are shuffled, and the index is the mean over several shuffles. (From 64 Sobol points, the index for y of
-3 x + y has a root-mean-square error of 0.3 without shuffling, and of 0.07 with it.)
+SALib. The method sorts the results by one parameter and assumes random order of the others. Sobol points and grids have
+none: neighbours in one coordinate alternate between low and high values of another. Therefore neighbours are shuffled,
+and the index is the mean over several shuffles. For y of 3 x + y at 64 Sobol points, the root-mean-square error of the
+index is 0.3 without shuffles and 0.07 with them.
 
-Matplotlib and SALib are optional, and imported where they are needed.
+Matplotlib and SALib are optional; functions import them.
 """
 
 from __future__ import annotations
@@ -55,7 +55,7 @@ class PlotData(NamedTuple):
 
 
 def plot(data: PlotData, file: BinaryIO) -> None:
-    """Plot sweep.png, with a panel for each result and each of the most sensitive parameters.
+    """Plot sweep.png: a panel for each pair of a result and one of the most sensitive parameters.
 
     Args:
         data: parameters and results of the plotted runs.
@@ -133,7 +133,7 @@ def _plot_runs(axes: Axes, parameter: VariedParameter, numbers: NDArray[np.float
 
 
 def _plot_index(axes: Axes, index: SensitivityIndex) -> None:
-    """Plot the index as a bar above a panel, whose width is 1."""
+    """Plot the index as a bar above a panel; the width of the panel is 1."""
     low, middle, high = np.clip(index.first_order + index.confidence * np.array([-1, 0, 1]), 0, 1)
     line_style: dict[str, Any] = {"transform": axes.transAxes, "clip_on": False, "solid_capstyle": "butt"}
     for left, right, colour, width in ((0, 1, PALE, 5), (0, middle, ORANGE, 5), (low, high, INK, 0.8)):
@@ -167,7 +167,7 @@ def _format_axis(axes: Axes, parameter: VariedParameter) -> None:
 
 
 def _tick_label(number: float, _: float) -> str:
-    """Format a number with its exponent, as a common one above the axis would overlap the sensitivity bar."""
+    """Format a number with its own exponent: a common one above the axis would overlap the sensitivity bar."""
     if number == 0 or 1e-3 <= abs(number) < 1e5:
         return f"{number:.10g}"
     digits, exponent = f"{number:.10e}".split("e")
@@ -228,7 +228,7 @@ def write_contact_sheet(
 
 
 def draw_largest_frame(directory: Path) -> NDArray[np.uint8]:
-    """Draw the frame of a run with the largest displacement on one thread, shape (height, width, 3)."""
+    """Draw the frame of the largest displacement of a run on one thread; shape (height, width, 3)."""
     from taichi_msm.runs.playback import Playback
 
     with Playback(directory, threads=1) as run:
@@ -238,7 +238,7 @@ def draw_largest_frame(directory: Path) -> NDArray[np.uint8]:
 def _largest_frames(
     directories: dict[int, Path], executor: Executor, progress: StageProgressCallback
 ) -> tuple[dict[int, Image.Image], list[str]]:
-    """Read or draw the frames of complete runs with the largest displacement; return them by run, and the errors."""
+    """Read or draw the frame of the largest displacement of each run; return the frames by run, and the errors."""
     frames: dict[int, Image.Image] = {}
     futures: dict[int, Future[NDArray[np.uint8]]] = {}
     errors = []
@@ -248,7 +248,7 @@ def _largest_frames(
             if finished.has_output("png"):
                 frames[run] = Image.fromarray(finished.read_picture("png", finished.largest_frame))
             elif finished.has_output("gif"):
-                # In the middle of the frame, whose beginning is rounded.
+                # The middle of the frame: a GIF rounds its beginning.
                 time = (finished.largest_frame + 0.5) / finished.scene.time.frames_per_second
                 frames[run] = read_gif_frame(finished.result_path("gif"), time)
             elif finished.has_output("trajectory") and finished.scene.image is not None:
@@ -275,7 +275,7 @@ def read_gif_frame(path: Path, time: float) -> Image.Image:
         time: time from its start [s].
 
     Returns:
-        The RGB picture at that time; after the end the last one.
+        The RGB picture at the time, or the last one after the end.
 
     Raises:
         FilesError: when the GIF cannot be read or decoded.
@@ -290,7 +290,7 @@ def read_gif_frame(path: Path, time: float) -> Image.Image:
 
 
 def _column_count(state: SweepState, tiles: int) -> int:
-    """Choose the number of columns: that of the values of a grid's last key, otherwise about that of the rows."""
+    """Choose the number of columns: the number of values of a grid's last key, or about the number of rows."""
     last = list(state.sweep.settings.distributions.values())[-1]
     if tiles == len(state.outcomes) and last.kind == "grid" and 1 < len(last.values) <= 8:
         return len(last.values)
@@ -334,7 +334,7 @@ def _wrap(parts: Iterable[str], fits: Callable[[str], bool]) -> list[str]:
         if fits(longer):
             lines[-1] = longer
             continue
-        # A limit above the length of any line bounds the number of iterations.
+        # 300 characters are longer than any line; the limit bounds the loop.
         cut = part[:300]
         while not fits(cut):
             cut = f"{cut[:-2]}…"
@@ -420,7 +420,7 @@ def varied_results(state: SweepState, runs: Sequence[int]) -> dict[str, NDArray[
 
 
 def is_wide_range(numbers: NDArray[np.float64]) -> bool:
-    """Return whether numbers, apart from NaN, are positive and span a ratio above 50, for a logarithmic axis."""
+    """Return whether an axis is logarithmic: all numbers but NaN are positive, with a ratio above 50."""
     return bool(np.nanmin(numbers) > 0 and np.nanmax(numbers) > 50 * np.nanmin(numbers))
 
 
@@ -464,7 +464,7 @@ def estimate_sensitivity(
         results: by name, shape (runs,); NaN where a run lacks the result.
 
     Returns:
-        An index for every parameter of every result that at least 64 runs have.
+        Indices of all parameters, for each result of at least 64 runs.
 
     Raises:
         ImportError: when SALib is not installed.
@@ -498,7 +498,7 @@ def first_order_index(parameter: NDArray[np.float64], result: NDArray[np.float64
     for shuffle in range(8):
         shuffled = random.permutation(len(result))
         ranks = np.argsort(np.argsort(parameter[shuffled], kind="stable"), kind="stable")
-        # Four neighbours are in random order.
+        # Ranks in groups of four keep their random order.
         ordered = result[shuffled][np.argsort(ranks // 4, kind="stable")]
         positions = np.arange(len(result), dtype=np.float64)[:, np.newaxis]
         analysis = rbd_fast.analyze(problem, positions, ordered, M=4, num_resamples=25, seed=1 + shuffle)

@@ -1,7 +1,7 @@
-"""A process pool as a `concurrent.futures` executor, whose processes may be killed one by one.
+"""A process pool as a `concurrent.futures` executor that survives the death of a process.
 
-Unlike in the standard library's pool, processes do not import the caller's main module, and if one is killed, only its
-call fails with a `DiedError`; the next call starts a new process.
+A killed process fails only its own call, with a `DiedError`; the next call starts a new process. Unlike the standard
+library's pool, processes do not import the caller's main module.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ PARENT_POLL_S = 0.2
 
 
 class DiedError(MsmError):
-    """Raised when the process of a call ended before the call returned."""
+    """The process of a call ended before the call returned."""
 
 
 class Pool(Executor):
@@ -58,8 +58,8 @@ class Pool(Executor):
         """End the processes after their calls.
 
         Args:
-            wait: whether to wait for the end of the calls.
-            cancel_futures: whether to cancel pending calls, and to kill the processes at once.
+            wait: whether to wait for running calls.
+            cancel_futures: whether to cancel pending calls and kill the processes at once.
         """
         self._threads.shutdown(wait=False, cancel_futures=cancel_futures)
         if cancel_futures:
@@ -147,7 +147,7 @@ def serve() -> None:
 
 
 def _exit_with_parent(parent: int) -> None:
-    """End this process after the death of its parent, which unlocks the directory of its run."""
+    """Exit after the death of the parent process, to unlock the directory of the run."""
     while os.getppid() == parent:
         time.sleep(PARENT_POLL_S)
     os._exit(1)

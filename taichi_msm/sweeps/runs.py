@@ -44,7 +44,7 @@ FINAL_STATUSES = ("complete", "diverged")
 
 
 def _register(sweep: Sweep, directory: Path) -> list[list[Any]]:
-    """Write the description of a sweep to its directory, or check it there; return the values of the runs."""
+    """Write the record of a sweep to its directory, or compare an existing record; return the values of the runs."""
     record = require_kind(directory / SWEEP_RECORD, FILE)
     require_kind(directory / RUNS_FOLDER, FOLDER)
     description, values = sweep.description(), sweep.values()
@@ -65,7 +65,7 @@ def _register(sweep: Sweep, directory: Path) -> list[list[Any]]:
     # Values are compared as text: 1 differs from 1.0, and NaN equals itself.
     expected_values = json.dumps(values)
     try:
-        # Bounds the memory for a foreign file.
+        # The limit bounds the memory for a foreign file.
         stored = json.loads(read_regular(record, max(1 << 28, 2 * len(expected_values))))
         earlier = {name: stored.get(name) for name in description}
         stored_values, stored_versions = json.dumps(stored["values"]), result_versions(stored["versions"], "cpu")
@@ -86,7 +86,7 @@ def _register(sweep: Sweep, directory: Path) -> list[list[Any]]:
             [f"{directory}: the sweep began with {', '.join(required)}; use these, or choose another --out"]
         )
     if stored_values != expected_values:
-        message = "its values are not those of the sweep file, as it is damaged or of another SciPy"
+        message = "its values differ from those of the sweep file: damaged, or written with another SciPy"
         raise FilesError(f"{record}: {message}; choose another --out")
     return values
 
@@ -97,9 +97,9 @@ class SweepState:
 
     directory: Path
     sweep: Sweep
-    values: list[list[Any]]  # of the varied keys, for each run of the sweep
-    outcomes: list[Outcome]  # of the finished runs; grows while the sweep runs
-    missing: list[RunTask] = field(default_factory=list)  # unfinished runs at the beginning
+    values: list[list[Any]]  # values of the varied keys, for each run of the sweep
+    outcomes: list[Outcome]  # outcomes of the finished runs; grows while the sweep runs
+    missing: list[RunTask] = field(default_factory=list)  # runs that were unfinished when the sweep began or resumed
 
     def columns(self) -> dict[str, list[Any]]:
         """Return the result columns of the table by name."""
@@ -128,7 +128,7 @@ def begin_sweep(sweep: Sweep, directory: Path, shard: tuple[int, int] = (1, 1)) 
         The finished and the missing runs of the shard.
 
     Raises:
-        SceneError: when the directory contains another sweep, or versions with other results.
+        SceneError: when the directory contains another sweep, or the runs of versions with other results.
         FilesError: when the directory cannot be read or written, contains foreign files, or is damaged.
     """
     state = SweepState(directory, sweep, _register(sweep, directory), [])
@@ -148,11 +148,11 @@ def read_outcome(task: RunTask, sweep: Sweep) -> Outcome | None:
     """Read the outcome of a finished run.
 
     Args:
-        task: the run; its overrides must be those of the record.
-        sweep: its files must contain those of the record.
+        task: the run, with the overrides that the record must have.
+        sweep: the sweep, with all files that the record may have.
 
     Returns:
-        The outcome; None if the record is missing or damaged, of an interrupted run, or of another task.
+        The outcome; None if the record is missing, damaged, or of an interrupted run or another task.
     """
     # A run with a damaged record is repeated.
     with suppress(OSError, ValueError, KeyError, TypeError, AttributeError, RecursionError):
@@ -193,8 +193,8 @@ def run_missing(state: SweepState, executor: Executor, progress: StageProgressCa
     A run whose process in `Pool` ended early is executed once more.
 
     Args:
-        state: the sweep; outcomes are appended.
-        executor: executes the runs.
+        state: the sweep; receives the outcomes.
+        executor: executor of the runs.
         progress: called several times a second; an exception from it ends the sweep.
 
     Yields:
@@ -271,7 +271,7 @@ def execute_run(task: RunTask, progress: StageProgressCallback = lambda stage, d
         progress: called several times a second; may raise KeyboardInterrupt, as in `runs.run.run`.
 
     Returns:
-        The outcome, also of a run that fails: the function raises nothing but an exception from `progress`.
+        The outcome, also of a failed run; only exceptions from `progress` are raised.
     """
     os.chdir(task.home)
     status: Status
@@ -284,7 +284,7 @@ def execute_run(task: RunTask, progress: StageProgressCallback = lambda stage, d
     except Exception as error:
         bug = f"a bug, please report it: {type(error).__name__}: {error}"
         status, reason = "failed", errors.out_of_memory(error) or bug
-    # The reason is independent of absolute paths. The path of a picture follows a space.
+    # Removes absolute paths from the reason; the path of a picture follows a space.
     reason = " ".join(reason.split()).replace(str(task.directory), task.directory.name)
     return Outcome(task.run, status, reason.replace(f" {task.scene.folder / '_'}"[:-1], " "))
 
@@ -322,7 +322,7 @@ class Outcome:
     error_estimate: float | None = None  # discretisation error (time step), as a fraction of the largest displacement
     mesh_error: float | None = None  # discretisation error (mesh), as a fraction of the largest displacement
     forces: tuple[float | None, ...] = ()  # largest force of each probe over all frames [N]
-    notes: tuple[str, ...] = ()  # warnings of the run, except the first, about its errors
+    notes: tuple[str, ...] = ()  # warnings of the run, without the first one (error estimates)
     seconds: float | None = field(default=None, compare=False)  # wall-clock time of the run [s]
 
 
@@ -330,7 +330,7 @@ _OUTCOME = TypeAdapter(Outcome)
 
 
 def _outcome_from_record(run: int, record: Mapping[str, Any]) -> Outcome:
-    """Extract the outcome of a run from its run.json; raise any exception if no run wrote it."""
+    """Extract the outcome of a run from its run.json; other content raises an arbitrary exception."""
     estimate = record["error_estimate"] or {}
     return _OUTCOME.validate_python(
         {

@@ -38,7 +38,7 @@ from taichi_msm.scene.section import (
 )
 from taichi_msm.sweeps.expressions import CONSTANTS, FUNCTIONS, ExpressionError, evaluate, replace_expressions
 
-# Columns of table.csv between the varied keys and the forces of the probes, which are followed by the seconds.
+# Columns of table.csv between those of the varied keys and of the probes' forces.
 RESULT_COLUMNS = ("status", "error", "max_displacement", "shortest_spring", "error_estimate", "mesh_error")
 
 MAX_RUNS = 10**7
@@ -53,7 +53,7 @@ NonEmptyList = Annotated[list[Any], Field(min_length=1)]
 
 
 class Distribution(Section):
-    """Distribution of a varied key: exactly one of its fields. Lists of numbers vary componentwise."""
+    """Distribution of a varied key, with exactly one field set; lists of numbers vary componentwise."""
 
     model_config = ConfigDict(validate_default=False)
 
@@ -111,7 +111,7 @@ class Distribution(Section):
         try:
             json.dumps(value, allow_nan=False)
         except ValueError:
-            raise scene_fault(f"{format_value(value)} has a number that is not finite; take others") from None
+            raise scene_fault(f"{format_value(value)} has an infinite number or NaN; take finite ones") from None
         return value
 
     @model_validator(mode="after")
@@ -132,7 +132,7 @@ class Distribution(Section):
 
     @property
     def dimensions(self) -> int:
-        """Number of fractions for `value`: one per number, 1 for a choice, 0 for a grid."""
+        """Number of fractions that `value` takes: 1 per number, 1 for a choice, 0 for a grid."""
         if self.kind in ("choice", "grid"):
             return int(self.kind == "choice")
         return len(_numbers(self.values[0]))
@@ -154,7 +154,7 @@ def _quantile(kind: str, first: float, second: float, fraction: float) -> float:
         return first + second * float(ndtri(max(fraction, 2.0**-31)))
     if kind == "log_uniform":
         low, high = math.log(first), math.log(second)
-        # Rounding could leave the interval.
+        # Rounded values could be outside the interval.
         return min(max(math.exp(low + (high - low) * fraction), first), second)
     return first + (second - first) * fraction
 
@@ -176,7 +176,7 @@ def _numbers(value: Any) -> list[float]:
 
 
 def _shape(value: Any) -> Any:
-    """Return nested lists of numbers with None for each number."""
+    """Return the shape of nested lists, with None in place of each number."""
     return [_shape(item) for item in value] if isinstance(value, list) else None
 
 
@@ -232,7 +232,7 @@ class SweepSettings(Section):
                 or keyword.iskeyword(name)
                 or not re.fullmatch(r"[A-Za-z_]\w*", name, re.A)
             ):
-                raise scene_fault("is not a name of a variable; take letters, digits and _, such as x1", name)
+                raise scene_fault("is not a valid name; take letters, digits and _, such as x1", name)
             for value in distribution.values:
                 if isinstance(value, list) or not _numbers(value):
                     raise scene_fault(
@@ -277,7 +277,7 @@ def spread(total: int, limit: int) -> list[int]:
 
     Args:
         total: number of runs.
-        limit: largest number of returned ones.
+        limit: maximum number of returned runs.
     """
     count = min(total, limit)
     return [(2 * n + 1) * total // (2 * count) for n in range(count)]
@@ -292,7 +292,7 @@ class Sweep:
 
     @property
     def keys(self) -> list[str]:
-        """The variables, and the varied keys as dotted paths."""
+        """Names of the variables, then dotted paths of the varied keys."""
         return list(self.settings.distributions)
 
     @property
@@ -318,8 +318,8 @@ class Sweep:
         from scipy.stats import qmc
 
         counts = [distribution.dimensions for distribution in distributions]
-        # A generator is passed, as versions of SciPy derive different ones from an integer. Other numbers of points
-        # than powers of two would cause a warning of SciPy.
+        # Versions of SciPy derive different generators from an integer seed. SciPy warns unless the number of points is
+        # a power of two.
         sequence = qmc.Sobol(sum(counts), scramble=True, seed=np.random.default_rng(self.settings.seed))
         count = min(self.runs, limit)
         points = sequence.random_base2(math.ceil(math.log2(count)))[:count]
@@ -340,8 +340,7 @@ class Sweep:
     def overrides(self, values: list[Any]) -> tuple[str, ...]:
         """Return the arguments of `run --set` for a run.
 
-        A key whose expression has no value for these variables is set to a text with the reason, so that the run is
-        refused.
+        A key whose expression has no value is set to the text of its error, so that the run is refused.
         """
         settings, count = self.settings, len(self.settings.variables)
         variables = dict(zip(settings.variables, values[:count], strict=True))
@@ -381,7 +380,7 @@ class Sweep:
         return frozenset(self.files.values())
 
     def description(self) -> dict[str, Any]:
-        """Return all settings that determine the results as JSON data; equal sweeps have equal descriptions."""
+        """Return all settings that affect the results, as JSON data; equal sweeps have equal descriptions."""
         settings = self.settings
         variables, vary = (
             {name: {distribution.kind: distribution.values} for name, distribution in section.items()}
@@ -446,7 +445,7 @@ def _checked(data: dict[str, Any], folder: Path) -> tuple[Sweep | None, list[Pro
         path = folder / name
         problems += _relocate(vary, fixed, folder, path.parent)
         try:
-            # Without its folder, as errors of runs must not depend on the current directory.
+            # The name has no folder: errors of runs must not depend on the current directory.
             file = scene_file.read_file(_normalised(path), scene_file.SCENE_KIND)._replace(name=path.name)
             problems += _unknown_keys(file, vary, fixed)
         except SceneError as error:
@@ -457,7 +456,7 @@ def _checked(data: dict[str, Any], folder: Path) -> tuple[Sweep | None, list[Pro
 
 
 def _expression_problems(variables: dict[str, Any], fixed: dict[str, Any]) -> list[Problem]:
-    """Check the expressions in `set`, with NaN for all variables, for which those of single runs have no problems."""
+    """Return the errors of the expressions in `set` that do not depend on the values of the variables."""
     names = dict.fromkeys(variables, math.nan)
     problems = []
 
@@ -491,8 +490,8 @@ def format_override(value: Any) -> str:
 
 
 def _relocate(vary: dict[str, Any], fixed: dict[str, Any], folder: Path, home: Path) -> Iterator[Problem]:
-    """Expand file patterns, and convert paths from the base `folder` to the base `home`, the scene's folder."""
-    places: list[tuple[Key, Any]] = []  # of values, and the list or mapping that contains them
+    """Expand file patterns, and convert paths relative to `folder` to paths relative to `home`, the scene's folder."""
+    places: list[tuple[Key, Any]] = []  # key of each value, and the list or mapping that contains it
     for name, distribution in vary.items():
         for kind in {"choice", "grid"} & set(distribution if isinstance(distribution, dict) else ()):
             key = _split_key(name)
@@ -515,7 +514,7 @@ def _relocate(vary: dict[str, Any], fixed: dict[str, Any], folder: Path, home: P
         elif not os.path.isfile(path):  # noqa: PTH113  # Path.is_file raises an error for a long name
             message = f"{truncate(text)}: no such file; name a {noun} relative to the sweep file"
             problems.append(Problem(place, message))
-        # Resolved first, as .. after a symbolic link is the parent of its target.
+        # Resolve links first: .. after a symbolic link is the parent of its target.
         return Path(os.path.relpath(path.parent.resolve() / path.name, home.resolve())).as_posix()
 
     for place, container in places:
@@ -549,7 +548,7 @@ def _split_key(name: str) -> Key:
 
 
 def _unknown_keys(scene: scene_file.ParsedFile, vary: dict[str, Any], fixed: dict[str, Any]) -> Iterator[Problem]:
-    """Check that a scene has the keys, by trying one value of each."""
+    """Yield an error for each key that the scene does not have; one value of each key is tried."""
     trials: dict[Key, Any] = {("set", name): value for name, value in fixed.items()}
     for name, distribution in vary.items():
         values = next(iter(distribution.values()), None) if isinstance(distribution, dict) else None
@@ -568,7 +567,7 @@ def _unknown_keys(scene: scene_file.ParsedFile, vary: dict[str, Any], fixed: dic
     for problem in parse_model(Scene, draft.data)[1]:
         if not problem.message.startswith("unknown key"):
             continue
-        # The unknown key may be above a tried key, in the section that is its value, or in the scene file.
+        # The unknown key is a prefix of a tried key, a key in its value, or a key of the scene file.
         related = [
             path
             for path, key in keys.items()

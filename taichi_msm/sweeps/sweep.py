@@ -45,30 +45,30 @@ def sweep(
 ) -> Iterator[Outcome]:
     """Run a scene many times with varied values.
 
-    Runs are executed while the iterator is consumed, which yields outcomes in order of completion. After the last run
-    the table and the other reports are written. The same call again executes only the missing runs.
+    The iterator executes the runs and yields their outcomes in order of completion; after the last run it writes the
+    table and the other reports. A repeated call executes only the missing runs.
 
     Args:
         scene: path of the scene file.
-        vary: distributions by dotted key, as in a sweep file. Paths of files are relative to the scene file, and below
-            its folder.
+        vary: distributions by dotted key, as in a sweep file; paths are relative to the scene file, and below its
+            folder.
         directory: receives runs/, table.csv and the other reports.
         variables: distributions of the numbers in expressions of `overrides`, by name, as in a sweep file.
-        samples: number of runs; None for every combination of the keys' grids.
+        samples: number of runs; None for all combinations of the grids.
         seed: seed of the samples.
         overrides: values of keys in all runs, by dotted key; texts that begin with = are expressions of the variables.
-        executor: executes the runs, by default in processes on this machine. Its workers must be processes with one
-            thread, with scene and directory at the same paths. A string is the address of a dask.distributed scheduler.
+        executor: executor of the runs, whose workers are processes with one thread and the same paths of scene and
+            directory; the address of a dask.distributed scheduler; or None for processes on this machine.
         workers: number of processes on this machine, by default one per core, limited by the free memory.
-        progress: called often with the stage, the number of finished runs and the number of runs; an exception from it
-            stops the sweep.
+        progress: called often with the stage, the finished and the total number of runs; its exceptions stop the
+            sweep.
 
     Returns:
         An iterator over the outcomes of all runs.
 
     Raises:
-        ArgumentError: when the directory cannot be a path.
-        SceneError: when arguments are invalid, with a line for each error; when the directory holds another sweep.
+        ArgumentError: when the directory is not a path.
+        SceneError: when arguments are invalid, with a line for each error, or the directory contains another sweep.
         FilesError: when the directory cannot be written.
         NotInstalledError: while iterating, when dask.distributed is needed and not installed.
         MsmError: while iterating, when no scheduler answers, or the executor accepts no more runs.
@@ -144,8 +144,8 @@ def finish_sweep(state: SweepState, executor: Executor, progress: StageProgressC
     """Write the table and the other reports of a sweep whose runs have ended.
 
     Args:
-        state: the sweep; outcomes of runs that another command has finished are replaced.
-        executor: draws the last frames of runs without pictures.
+        state: the sweep; receives the outcomes of runs that another command has finished.
+        executor: executor that draws the frames of runs without pictures.
         progress: called while another command writes the reports, and while frames are drawn.
 
     Returns:

@@ -1,8 +1,7 @@
 """Reports of a sweep: table, description of the data set, plots, summary, and cost estimate.
 
-In the order of the SHA-256 of "SEED RUN", the first tenth of the runs is the test split and the second tenth the
-validation split. The split of a run depends only on the seed, the number of the run and the number of runs: not on
-failures or versions of libraries.
+Runs are sorted by the SHA-256 of "SEED RUN": the first tenth is the test split, the second tenth the validation split.
+The split of a run depends only on the seed, the number of the run and the number of runs.
 """
 
 from __future__ import annotations
@@ -48,7 +47,7 @@ def write_reports(
 
     Args:
         state: the finished sweep.
-        executor: draws the last frames of runs without pictures.
+        executor: executor that draws the frames of runs without pictures.
         progress: called with the stage, the drawn and the total number of frames.
 
     Returns:
@@ -71,7 +70,7 @@ def write_reports(
                 notes += write(state, written)
             except Exception as error:
                 # A failing report must not discard hours of runs.
-                notes.append(f"{name} could not be made: {type(error).__name__}: {error}")
+                notes.append(f"{name} could not be written: {type(error).__name__}: {error}")
         for path in (state.directory / name for name in REPORT_FILES if name not in written):
             if not path.is_dir():
                 path.unlink(missing_ok=True)
@@ -202,7 +201,7 @@ def write_dataset(state: SweepState, written: list[str]) -> list[str]:
 
 
 def assign_splits(runs: int, seed: int) -> list[str]:
-    """Return the split of every run, "train", "val" or "test", as described above.
+    """Return the split of every run: "train", "val" or "test".
 
     Args:
         runs: number of runs.
@@ -237,8 +236,8 @@ def cost_line(runs: int, expected: SweepCost, workers: WorkerCount | None) -> st
 
     Args:
         runs: number of runs.
-        expected: their cost.
-        workers: processes of this machine; None for a cluster.
+        expected: cost of the runs.
+        workers: number of processes of this machine; None for a cluster.
     """
     location = "if they were run here"
     if workers is not None:
@@ -280,13 +279,13 @@ def summary_lines(
             largest, run = max(errors)
             statistics = f"median {median(error for error, _ in errors):.2g}, largest {largest:.2g} (run {run:06})"
             lines.append(f"error, as a fraction of the largest displacement, due to {cause}: {statistics}")
-    # An example of the five most frequent warnings, where numbers are ignored.
+    # One example of each of the five most frequent warnings; warnings that differ only in numbers are one group.
     groups: dict[str, list[str]] = {}
     for outcome in outcomes:
         for note in outcome.notes:
             groups.setdefault(re.sub(r"[0-9.e+-]+", "", note), []).append(f"run {outcome.run:06}: {note}")
     for group in sorted(groups.values(), key=len, reverse=True)[:5]:
-        lines.append(f"{_runs(len(group))} with a note, for example {group[0]}")
+        lines.append(f"{_runs(len(group))} with a warning, for example {group[0]}")
     return [*lines, "without --shard, the same command writes the table" if shard else ", ".join(files), *notes]
 
 
@@ -360,7 +359,7 @@ def choose_worker_count(expected: SweepCost, runs: int, requested: int | None = 
     Args:
         expected: cost of the sweep, with the memory of a process.
         runs: number of runs.
-        requested: number of processes that the user has requested, which is not limited; None to choose.
+        requested: number of processes requested by the user, without limits; None for the automatic choice.
 
     Returns:
         The number and its limits.

@@ -16,7 +16,7 @@ from taichi_msm.view.material import MATERIAL
 MAX_BYTES = 512
 MAX_VALUE = 1e12
 
-# The page has read a picture, and may get another.
+# Message of a page that has read a picture.
 SHOWN = ["shown"]
 
 

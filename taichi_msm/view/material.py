@@ -8,7 +8,7 @@ from typing import Any
 from taichi_msm.scene.scene import Scene
 from taichi_msm.scene.section import Section
 
-# Name and unit of the keys; those of a scene that are not above 0 cannot be changed.
+# Name and unit of each key; a session can change the values above 0.
 MATERIAL = {
     "tissue.young": ("Young's modulus", "Pa"),
     "tissue.foundation": ("foundation", "N/m³"),
@@ -20,7 +20,7 @@ MATERIAL = {
     "damping": ("damping", "N s/m"),
 }
 
-# Largest factor, and its inverse the smallest, of the scene's value.
+# A value changes by at most this factor, up or down, from that of the scene.
 MAX_FACTOR = 10.0
 
 

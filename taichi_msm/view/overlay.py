@@ -23,7 +23,7 @@ OUTLINE_GREY = 140
 class ValueBar(NamedTuple):
     """A value as a bar, scaled to the largest value so far, rounded up."""
 
-    value: float  # in `unit`, as the others
+    value: float  # [unit]
     largest: float  # positive
     unit: str
 
@@ -77,7 +77,7 @@ def mark_tool(picture: Picture, pixel: tuple[float, float], *, pulls: bool) -> N
     radius = picture.shape[0] * (1 / 50)
     reach = int(radius) + 4
     left, top = max(0, int(pixel[0]) - reach), max(0, int(pixel[1]) - reach)
-    # Copying only this region is much faster than the whole picture.
+    # A copy of this region is much faster than one of the whole picture.
     region = picture[top : max(0, int(pixel[1]) + reach), left : max(0, int(pixel[0]) + reach)]
     if region.size == 0:
         return

@@ -24,14 +24,14 @@ from taichi_msm.scene.scene import Scene
 
 
 class Film:
-    """A film of a session, encoded in a hidden folder while the session runs; `close` removes it unless it was moved.
+    """A film of a session, encoded in a hidden folder while the session runs; `close` removes the folder.
 
     The constructor and the methods raise a FilesError when the film cannot be written.
 
     Args:
         path: the film, .gif or .mp4; the hidden folder is in its folder.
         option: name of the option in messages.
-        render: has the size and background of the pictures.
+        render: settings with the size and background of the pictures.
         rate: frames of the session per second.
         subframes: frames of the session per picture.
         begin: first frame of the session.
@@ -56,7 +56,7 @@ class Film:
 
         Args:
             picture: shape (height, width, 3).
-            frame: its frame of the session.
+            frame: number of the frame in the session.
         """
         with writing(*self._location):
             while self.pictures * self._subframes <= frame - self._begin:
@@ -116,7 +116,7 @@ class Captures:
 
         Args:
             film: a film with at least one picture.
-            path: its file, which is replaced; None for a free name in the folder.
+            path: path of the file, replaced if it exists; None for a free name in the folder.
 
         Returns:
             The path of the saved file.

@@ -178,7 +178,7 @@ def record_film(
     progress: Callable[[int, int], None] = lambda done, total: None,
     notify: Callable[[str], None] = lambda notice: None,
 ) -> None:
-    """Run a session without a page, and record a film, which replaces an earlier file at the end.
+    """Run a session without a page and record a film; its end replaces an earlier file.
 
     Args:
         session: a new session.

@@ -1,6 +1,6 @@
-"""A session in browsers: a server on the loopback interface only sends pictures and readings, and receives events.
+"""A session in browsers: a server sends pictures and readings, and receives events, on the loopback interface only.
 
-Tornado serves it: one wheel without dependencies (docs/decisions/0032). The session and the server share a thread, as
+The server is Tornado's, one wheel without dependencies (docs/decisions/0032). It shares a thread with the session, as
 Taichi holds Python's lock while a kernel runs.
 """
 
@@ -36,7 +36,7 @@ from taichi_msm.view.tools import PositionControlledTool
 
 ADDRESS = "127.0.0.1"
 
-# The files of the page, by their path below the token, and their types.
+# File name and media type of each file of the page, by its path below the token.
 PAGE = {
     "": ("index.html", "text/html"),
     "style.css": ("style.css", "text/css"),
@@ -52,21 +52,21 @@ HEADERS = {
     "X-Content-Type-Options": "nosniff",
 }
 
-# Number of pictures on the way to a page, so that a slow connection lags by no more than these.
+# Largest number of unread pictures of a page; limits the lag of a slow connection.
 MAX_UNREAD_PICTURES = 3
 
 MAX_PAGES = 16
 
-# Number of events that the page that steers may send within a frame.
+# Largest number of events within a frame, from the page that steers.
 MAX_EVENTS = 500
 
 # Shortest wait for events between two pictures [s].
 MIN_WAIT_S = 0.001
 
-# Longer delays are not caught up [s].
+# Largest delay of the simulation that is caught up [s].
 MAX_DELAY_S = 0.1
 
-# After this time of stepping the next picture follows, although frames are due [s].
+# Time limit of the steps between two pictures, even with frames due [s].
 MAX_STEPPING_S = 0.03
 
 
@@ -96,9 +96,9 @@ class Server:
 
     Args:
         session: a new session.
-        listener: see `listen`.
-        title: of the page.
-        origins: of pages behind a proxy, in addition to those of the loopback interface.
+        listener: listening socket, from `listen`.
+        title: title of the page.
+        origins: permitted origins of pages behind a proxy, in addition to those of the loopback interface.
 
     Attributes:
         url: address of the page, with the token.
@@ -138,18 +138,18 @@ class Server:
             for page in self.pages:
                 page.send(json.dumps({"ended": True}))
                 page.close(1001)
-            await asyncio.sleep(0.1)  # in which the pages receive it
+            await asyncio.sleep(0.1)  # The pages receive the message.
             await http.close_all_connections()
 
     def permits(self, request: HTTPServerRequest) -> bool:
-        """Return whether a request has the token, and an origin, if any, that is known."""
+        """Return whether a request has the token, and either no origin or a permitted one."""
         token = request.path.lstrip("/").partition("/")[0]
         origin = request.headers.get("Origin")
         known = origin is None or origin in self._origins or self._is_own(origin, request.host)
         return hmac.compare_digest(token.encode("utf-8", "replace"), self._token.encode()) and known
 
     def _is_own(self, origin: str, host: str) -> bool:
-        """Return whether an origin is this server's, or that of a port that `ssh -L` forwards to it."""
+        """Return whether an origin is that of this server, or of a port that `ssh -L` forwards to the server."""
         try:
             parts, forwarded = urlsplit(origin), urlsplit(f"//{host}").port
             is_plain = f"{parts.scheme}://{parts.netloc}" == origin and parts.scheme == "http"
@@ -184,7 +184,7 @@ class Server:
         self.pages.remove(page)
 
     def receive(self, page: _Connection, message: str | bytes) -> None:
-        """Queue the event of a message, or reply with its fault.
+        """Queue the event of a message, or reply with the error of an invalid message.
 
         Args:
             page: the sender; events are ignored unless it steers.
@@ -240,7 +240,7 @@ class Server:
                 page.readings.append(reading)
 
     def _show(self, pacing: str) -> None:
-        """Send the state, and the picture if it has changed, to the pages that have read the earlier ones."""
+        """Send the state, and a changed picture, to the pages with fewer unread pictures than the limit."""
         ready = [page for page in self.pages if page.unread < MAX_UNREAD_PICTURES]
         if not (ready or self._session.filming):
             return
@@ -301,7 +301,7 @@ class Pacing:
         return max(0.0, self._next - self._clock())
 
     def due_frames(self) -> Iterator[int]:
-        """Yield the number of each due frame, until none is due or they took `MAX_STEPPING_S`."""
+        """Yield the numbers of the due frames; after the first one, for at most `MAX_STEPPING_S`."""
         start = self._clock()
         self._next = max(self._next, start - MAX_DELAY_S)
         count = 0
@@ -315,7 +315,7 @@ class Pacing:
             self._pictures.popleft()
 
     def status(self) -> str:
-        """Format the pictures per second, and the speed relative to real time if it is below 95 %."""
+        """Format the pictures per second, and a speed below 95 % of real time."""
         if len(self._pictures) < 2:
             return ""
         seconds = self._pictures[-1][0] - self._pictures[0][0]
@@ -369,7 +369,7 @@ class _Connection(_Guarded, WebSocketHandler):
     Attributes:
         unread: number of pictures that the page has not read yet.
         readings: time [s], force [N] and depth [m] of the frames since the last picture.
-        jpeg: the last picture that was sent to it.
+        jpeg: last picture sent to the page.
     """
 
     def open(self) -> None:

@@ -44,7 +44,7 @@ NOTICE_DURATION_S = 3.0
 def divide_frames(plan: Plan) -> tuple[Plan, int]:
     """Divide the frames of a scene into equal subframes, at most `MAX_FRAME_RATE` per second.
 
-    With `precision: auto` they are in f32, which takes half the time: a session steps all the time, unlike a run.
+    `precision: auto` without a tolerance becomes f32, which takes half the time.
 
     Returns:
         The plan with subframes as frames, and the number of subframes per frame of the scene.
@@ -62,14 +62,14 @@ def divide_frames(plan: Plan) -> tuple[Plan, int]:
 
 
 class Session:
-    """Interactive simulation of a scene with a tool; a context manager, which saves a running film at its end.
+    """Interactive simulation of a scene with a tool; a context manager that saves a running film on exit.
 
-    A force-controlled tool has the force, falloff and offset of the scene's first probe with a force. A
-    position-controlled tool has the instrument and friction of the first probe with a path, otherwise the first
-    instrument. The first of these probes determines which one is the initial tool. Clamps always hold the sheet.
+    The force-controlled tool has the force, falloff and offset of the first probe with a force; the position-controlled
+    tool the instrument and friction of the first probe with a path, or of the first one with an instrument. The first
+    probe except clamps determines the initial tool. Clamps always hold the sheet.
 
     Args:
-        scene: the scene; the attribute has the frames and the time step of the session.
+        scene: the scene; the attribute of this name has the frames and the time step of the session.
         captures: receives saved files.
         arch: cpu, cuda or vulkan.
         threads: number of CPU threads, by default one per core.
@@ -106,7 +106,7 @@ class Session:
         self._film: Film | None = None
         self._film_path: Path | None = None
         self._scene_probes = tuple(probe for probe in scene.probes if play or probe.clamp is not None)
-        # Without outputs, their kernels are not compiled.
+        # No outputs: their kernels need no compilation.
         self._plan = replace(plan, scene=scene.model_copy(update={"output": ()}))
         self._force_tool = _force_tool(plan, self._scene_probes)
         self._position_tool = _position_tool(plan, self._scene_probes)
@@ -124,7 +124,7 @@ class Session:
         self.divergence_error = ""
         # Moving average of the time to simulate a frame [s].
         self._frame_time_s = 0.0
-        # Since the last reset [N].
+        # Largest force since the last reset [N].
         self._max_felt_force = 0.0
         progress("compile")
         # Workers spin while they wait for each other; one core is left for the browser.
@@ -169,12 +169,12 @@ class Session:
         return 0.0 if isinstance(self.tool, ForceControlledTool) else self.tool_force()
 
     def material(self) -> dict[str, tuple[float, float]]:
-        """Return the values that an event `Material` can change, by key: the current one, and the scene's."""
+        """Return the current and the initial value of each key that an event `Material` can change."""
         current = material_values(self.scene)
         return {key: (current[key], initial) for key, initial in self._scene_material.items()}
 
     def recorded_scene(self) -> Scene:
-        """Return the session as a scene, whose run is bit-identical."""
+        """Return the session as a scene; its run is bit-identical to the session."""
         # The frame of a divergence is included, so that the run diverges too.
         frames = max(1, self.frame + bool(self.divergence_error))
         time = self.scene.time.model_copy(update={"duration": frames / self.frame_rate, "tolerance": None})
@@ -220,7 +220,7 @@ class Session:
         if (self.paused and not self._single_step) or self.divergence_error:
             return
         self._single_step = False
-        # At three quarters of the limit.
+        # Warn at three quarters of the limit of a scene file.
         if self.frame % 200 == 0 and not self._has_warned_of_length:
             self._has_warned_of_length = count_probe_values(self.recorded_scene()) > 0.75 * MAX_NODES
             if self._has_warned_of_length:
@@ -245,7 +245,7 @@ class Session:
         return self._film is not None
 
     def start_film(self, path: Path | None = None) -> None:
-        """Start a film, which is saved at its end under a path, or a free name in the folder of captures.
+        """Start a film; its end saves it to a path, or under a free name in the folder of captures.
 
         Raises:
             FilesError: when it cannot be written.
@@ -258,7 +258,7 @@ class Session:
             self._film.add_frame(self._draw(), self._elapsed)
 
     def picture(self) -> Picture:
-        """Draw the tissue and the overlay, shape (height, width, 3); a running film has the picture without text."""
+        """Draw the tissue and the overlay, shape (height, width, 3); add the picture without text to a running film."""
         picture = self.bare_picture()
         above = self._figure_lines() if self._show_figures else ["paused"] if self.paused else []
         keys, bar = (events.POINTER | events.KEYS if self._show_keys else None), None
@@ -269,7 +269,7 @@ class Session:
         return picture
 
     def bare_picture(self) -> Picture:
-        """Draw the tissue, with a mark at a tool without an instrument, also for a running film."""
+        """Draw the tissue, and a mark at a tool without an instrument; add the picture to a running film."""
         picture = self._draw()
         tool = self.tool
         hidden = isinstance(tool, PositionControlledTool) or tool.percent == 0 or tool.probe.instrument is not None
@@ -305,7 +305,7 @@ class Session:
         self.close()
 
     def _draw(self) -> Picture:
-        """Draw the tissue and the instruments, with that of the tool where it acts or would act."""
+        """Draw the tissue and the instruments; that of an idle tool is at the pointer."""
         positions, scene = self.positions(), self._simulation.scene
         instruments = place_instruments(scene, positions, self._simulation.time)
         instrument = scene.probes[-1].instrument
@@ -323,10 +323,10 @@ class Session:
         return surface_point(self.positions(), self.scene.render.refine, self.scene.sheet, rest)[0]
 
     def _press(self, x: float, y: float, direction: int) -> None:
-        """Press, or in direction -1 pull or grip, the tissue that is visible at a pixel.
+        """Press (direction 1), or pull or grip (-1), the tissue at a pixel.
 
-        A force-controlled tool acts on the material that is visible there. The tip of a position-controlled tool is
-        above or below the point of the rest plane.
+        A force-controlled tool acts on the visible material. A position-controlled tool acts at the point of the rest
+        plane.
         """
         position = self._simulation.pick((x, y), self.viewport.view)
         if position is None:
@@ -342,7 +342,7 @@ class Session:
     def _drag(self, x: float, y: float) -> None:
         """Move the pressing tool by the displacement of the pointer on the rest plane.
 
-        Picking the deformed sheet would feed back, as it moves with the tool.
+        The deformed sheet would cause feedback, as it moves with the tool.
         """
         if self._drag_start is None:
             return
@@ -362,7 +362,7 @@ class Session:
         self._drag_start = self._hover_pixel = None
 
     def _hover_position(self) -> SheetPosition | None:
-        """Return the position at which a force-controlled tool would press; None if it presses, or for other tools."""
+        """Return the position under the pointer for an idle force-controlled tool; None for all others."""
         if isinstance(self.tool, PositionControlledTool) or self.tool.engaged or self.tool.percent != 0:
             return None
         return None if self._hover_pixel is None else self._simulation.pick(self._hover_pixel, self.viewport.view)
@@ -407,7 +407,7 @@ class Session:
                 else:
                     self._end_film()
             case "w" if self._material_changed:
-                self.show_notice("no scene repeats a session whose material changed: reset (r), then do it again")
+                self.show_notice("a scene cannot contain a changed material: reset (r) and repeat the session")
             case "w":
                 self.show_notice(f"saved {self._captures.save_scene(self.recorded_scene())}")
             case "i":
@@ -421,7 +421,7 @@ class Session:
         session_tools = [tool for tool in plan.tools if tool.probe == len(self._scene_probes)]
         if any(path_problems(plan.scene, session_tools, plan.grid)):
             raise SceneError(
-                ["this tool cannot be position-controlled: its shaft leads down into the sheet; let it lead up"]
+                ["this tool cannot be position-controlled: its shaft points down into the sheet; turn it up"]
             )
         return plan
 
@@ -447,7 +447,7 @@ class Session:
         self.show_notice("; ".join(path_warnings(plan.scene, session_tools)))
 
     def _change_material(self, key: str, value: float) -> None:
-        """Change a value of the material, and continue; a reset then begins with this material."""
+        """Change a value of the material; later resets keep it."""
         initial = self._scene_material.get(key, 0.0)
         # The margin allows for rounding.
         if not initial / MAX_FACTOR * 0.999 <= value <= initial * MAX_FACTOR * 1.001:
@@ -483,7 +483,7 @@ class Session:
 
     @property
     def _pulls(self) -> bool:
-        """Whether the tool pulls; the force of a scene's probe may do so too."""
+        """Whether the tool pulls, by its direction or the sign of the probe's force."""
         tool = self.tool
         return (
             isinstance(tool, ForceControlledTool)
@@ -510,7 +510,7 @@ class Session:
 
 def _require_usable(scene: Scene, *, play: bool) -> None:
     errors = {
-        "image: missing; a session needs one, name it here or with --image": scene.image is None,
+        "image: missing; a session needs a picture, set it here or with --image": scene.image is None,
         "probes: empty; the tool takes its force from the first probe, add one": not scene.probes,
         "probes: a clamp is not a tool of a session; add a probe with a force": bool(scene.probes)
         and all(probe.clamp is not None for probe in scene.probes),

@@ -22,10 +22,10 @@ from taichi_msm.shapes import SHAPES
 # Rise time from no force to the full force, and travel time from the highest to the deepest position [s].
 RISE_TIME_S = 0.2
 
-# Number of latest keyframes that determine the next frame; there may be a jump at its beginning.
+# Number of latest keyframes that determine the next frame, including a jump at its beginning.
 ACTIVE_KEYFRAMES = 4
 
-# Height of the tip above the sheet at rest when it does not press [tip radii].
+# Height of an idle tip above the sheet at rest [tip radii].
 HOVER_HEIGHT_RADII = 1.0
 
 # Position on the sheet, fractions (across, down) of its size.
@@ -37,15 +37,15 @@ STARTS: tuple[SheetPosition, ...] = (CENTRE, *product((0.1, 0.9), (0.1, 0.9)), *
 
 
 def clear_start(probe: Probe, played: Sequence[Probe], scene: Scene) -> SheetPosition:
-    """Return a start at which an idle tool does not intersect the tools that are played in its session.
+    """Return a start at which an idle tool intersects no other tool of the session.
 
     Args:
         probe: probe of the tool.
         played: probes of the other tools.
-        scene: has the sheet and the duration of the motion.
+        scene: scene with the sheet and the duration of the motion.
 
     Returns:
-        The first such position of `STARTS`; the centre if there is none, or if the tool has no instrument.
+        The first such position of `STARTS`; the centre if there is none, or for a tool without an instrument.
     """
     if probe.instrument is None:
         return CENTRE
@@ -58,7 +58,7 @@ def clear_start(probe: Probe, played: Sequence[Probe], scene: Scene) -> SheetPos
 
 
 def _capsule(probe: Probe, sheet: Sheet) -> Tool:
-    """Build a capsule that moves with the instrument of a probe, on the sheet at rest if it is force-controlled."""
+    """Build a capsule that moves like the instrument of a probe; force-controlled ones stay on the sheet at rest."""
     assert probe.instrument is not None
     capsule = probe.instrument.model_copy(update={"radius": probe.instrument.outer_radius, "plate": None})
     (tool,) = build_tools([Probe(path=probe.path or ((0.0, *CENTRE, 0.0),), instrument=capsule)], sheet)
@@ -82,12 +82,11 @@ def _rounded(height: float) -> float:
 class ForceControlledTool:
     """A tool that presses at one control point at a time, with the force, falloff and offset of a probe.
 
-    Actions take effect at the next frame, at most one press or release per frame: the force jumps only between frames,
-    and is 0 for at least one frame before the tool acts at another position. It rises within `RISE_TIME_S`, and falls
-    to 0 at once.
+    Actions take effect at the next frame, at most one press or release per frame: the force is 0 for at least one frame
+    before the tool acts at another position. The force rises within `RISE_TIME_S`, and drops to 0 at a release.
 
     Args:
-        probe: has the force, falloff and offset.
+        probe: probe with the force, falloff and offset.
         frame_rate: frames per second of the session.
         start: position before the first press.
 
@@ -136,7 +135,7 @@ class ForceControlledTool:
             direction: 1 to press, -1 to pull.
         """
         if len(self._pending) > 1 and self._pending[-1] is None:
-            # Discard an earlier click without effect yet, such as in a paused session.
+            # Discard a pending click, such as one in a paused session.
             self._pending.pop()
             self._pending.pop()
         if self.engaged:
@@ -196,7 +195,7 @@ class ForceControlledTool:
 
 
 def _append_keyframe(keys: list[Any], key: tuple[float, ...]) -> None:
-    """Append a keyframe, a time [s] followed by values, and remove the middle one of three with equal values."""
+    """Append a keyframe (time [s], values...), and remove the middle one of three with equal values."""
     if len(keys) > 1 and keys[-1][1:] == keys[-2][1:] == key[1:]:
         keys.pop()
     keys.append(key)
@@ -214,27 +213,27 @@ MAX_DEPTH_RADII = 5.0
 # Coefficient of Coulomb friction of probes without one.
 DEFAULT_FRICTION = 0.5
 
-# Interval before the start, without effect, for which the kernel is compiled with grips.
+# Grip before the start [s]; has no effect, but the kernel is compiled with grips.
 NO_GRIP = (-2.0, -1.0)
 
 
 class PositionControlledTool:
     """A tool whose tip follows the pointer, above the sheet or at a given depth while it presses.
 
-    Between frames the tip moves in straight lines, up and down within `RISE_TIME_S`, and per step at most by the stride
-    that a run allows. A grip begins when the tip has reached its depth, and ends with the release.
+    The tip moves in straight lines between frames: up and down within `RISE_TIME_S`, and per step at most by the stride
+    of a run. A grip begins when the tip reaches its depth, and ends with the release.
 
     Args:
-        probe: has the instrument, and the friction if it is set; in quasi-static sessions rough or none.
-        plan: of the session.
+        probe: probe with the instrument, and optionally the friction; in quasi-static sessions rough or none.
+        plan: plan of the session.
         start: position before the pointer moves.
 
     Attributes:
         strength: depth of a press [% of the largest depth]; negative to lift a grip.
         position: current position of the tip, fractions (across, down) of the sheet.
-        target: position that the tip moves to.
+        target: goal of the tip, fractions (across, down) of the sheet.
         height: current height of the lowest point of the tip above the sheet at rest [m].
-        grid: of the session; a change of the material changes its step.
+        grid: time grid of the session; a changed material changes its step.
     """
 
     def __init__(self, probe: Probe, plan: Plan, start: SheetPosition = CENTRE) -> None:
@@ -314,7 +313,7 @@ class PositionControlledTool:
         self._move_tip()
         key = end, *self.position, self.height
         _append_keyframe(self._path, key)
-        # The end of an active grip is unknown, and set beyond the end of any session.
+        # An active grip has no known end: it ends after any session.
         grip = NO_GRIP if self._grip_start is None else (self._grip_start, self._grip_start + 1e9)
         return self._probe.model_copy(update={"path": (key,), "grip": (grip,)})
 
@@ -344,5 +343,5 @@ class PositionControlledTool:
             self.position, self.height = self.target, _rounded(goal)
 
     def _time(self, frame: int) -> float:
-        """Return the time of a frame [s], bit-identical to that of its step, so that the tip is exactly at its key."""
+        """Return the time of a frame [s], bit-identical to its step, so that the tip is exactly at the keyframe."""
         return self.grid.time(frame * self.grid.steps_per_frame)

@@ -21,7 +21,7 @@ class Viewport:
     """Interactive camera, light and mesh display of a session.
 
     Args:
-        renderer: has the initial settings in its scene.
+        renderer: renderer of a scene with the initial settings.
         play: whether to follow a moving camera of the scene; otherwise it stays at its initial pose.
 
     Attributes:
@@ -57,7 +57,7 @@ class Viewport:
         return moving
 
     def recorded_render(self, duration: float) -> Render:
-        """Return the drawing settings for a scene of a duration [s], with the last camera pose held until its end."""
+        """Return the drawing settings for a scene of a duration [s]; the last camera pose is held to the end."""
         camera = self.render.main_camera
         if isinstance(camera, Camera) and isinstance(camera.poses, tuple) and camera.poses[-1][0] < duration:
             last = (duration, *camera.poses[-1][1:])
@@ -90,8 +90,8 @@ class Viewport:
         """Draw the sheet and the instruments.
 
         Args:
-            positions: of the mass points [m], shape (rows, cols, 3).
-            instruments: placed in the scene.
+            positions: positions of the mass points [m], shape (rows, cols, 3).
+            instruments: instruments placed in the scene.
 
         Returns:
             Picture, shape (height, width, 3).

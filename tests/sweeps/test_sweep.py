@@ -268,7 +268,7 @@ def test_two_commands_write_one_table(many: Path, whole: Path) -> None:
     command = [sys.executable, "-m", "taichi_msm", "sweep", "many.yaml", "--workers", "1", "--out", "both", "--json"]
     processes = [subprocess.Popen(command, stdout=subprocess.PIPE) for _ in range(2)]
     records = [json.loads(process.communicate()[0]) for process in processes]
-    assert not [note for record in records for note in record["notes"] if "could not be made" in note]
+    assert not [note for record in records for note in record["notes"] if "could not be written" in note]
     assert (table("both"), runs("both")) == (table(whole), runs(whole))
 
 

@@ -206,7 +206,7 @@ def test_earlier_reports_are_replaced_atomically(make: Make, monkeypatch: pytest
     names, notes = write(result)
     assert names == ["table.csv", "table.parquet", "dataset.json", "sensitivity.csv"]
     assert {path.name for path in result.directory.iterdir()} == {"runs", "sweep.png", *names}
-    assert notes[1].startswith("sweep.png could not be made: ")
+    assert notes[1].startswith("sweep.png could not be written: ")
 
 
 def test_missing_libraries(make: Make, monkeypatch: pytest.MonkeyPatch) -> None:
