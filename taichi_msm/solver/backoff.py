@@ -1,7 +1,8 @@
 """Back-off of workers that wait for each other by spinning, on a CPU that other programs use too.
 
-After the timeout of a worker, a single worker steps for a back-off period. The period is the minimum, or longer if other
-programs compete for the cores: four times the last period, halved for every HALF_LIFE_S of parallel steps since then.
+After the timeout of a worker, a single worker steps for a back-off period. The period is the minimum, or longer if
+other programs compete for the cores: four times the last period, halved for every HALF_LIFE_S of parallel steps since
+then.
 """
 
 from __future__ import annotations

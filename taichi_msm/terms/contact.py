@@ -8,15 +8,15 @@ shape (`taichi_msm.shapes`), the correction is
     with friction mu:    w = the part of (u + correction - u_before) - (c - c_before) perpendicular to n
                          correction -= w min(1, mu depth / |w|)
 
-A grip holds the mass points within 1.5 radii of the tip's centre at its start: u = u_start + c - c_start. A clamp,
-a tool of radius 0, holds its mass points from the start of the run: u = c. A correction has the effect of a force, the
+A grip holds the mass points within 1.5 radii of the tip's centre at its start: u = u_start + c - c_start. A clamp, a
+tool of radius 0, holds its mass points from the start of the run: u = c. A correction has the effect of a force, the
 correction times m (1 + g h / 2) / h^2 (see `damping`), so the summed corrections yield the force of the tool.
 
 In quasi-static scenes a tool pushes the mass points that touch it and never pulls. It carries the part of their force F
-into its shape, min(F . n, 0) n; the remainder, tangential or outward, vanishes in equilibrium. The fields of corrections store
-the normals n, and 0 without contact. Held mass points, and those that stick to a rough tool, move with their tool, which
-carries their whole force. Projected Gauss-Seidel iteration finds the forces and corrections of several tools on one mass
-point.
+into its shape, min(F . n, 0) n; the remainder, tangential or outward, vanishes in equilibrium. The fields of
+corrections store the normals n, and 0 without contact. Held mass points, and those that stick to a rough tool, move
+with their tool, which carries their whole force. Projected Gauss-Seidel iteration finds the forces and corrections of
+several tools on one mass point.
 """
 
 # No `from __future__ import annotations` here: Taichi reads the annotations of a kernel.

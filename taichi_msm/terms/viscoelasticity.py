@@ -1,8 +1,8 @@
 """Stress relaxation: quasi-linear viscoelasticity (Fung) of all elastic forces. Scene: `tissue.relaxation`.
 
-Let f_n be the elastic force (springs, bending, foundation) on a mass point at step n, h the step [s], share_i and time_i
-[s] the parameters of branch i, and G the sum of the shares. With x_i = h / time_i and phi_i = (1 - exp(-x_i)) / x_i,
-the force
+Let f_n be the elastic force (springs, bending, foundation) on a mass point at step n, h the step [s], share_i and
+time_i [s] the parameters of branch i, and G the sum of the shares. With x_i = h / time_i and phi_i = (1 - exp(-x_i)) /
+x_i, the force
 
     (1 - G) f_n + sum of (s_i + share_i phi_i f_n)
 
