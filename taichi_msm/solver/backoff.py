@@ -1,7 +1,8 @@
 """Back-off of workers that wait for each other by spinning, on a CPU that other programs use too.
 
-After the timeout of a worker, a single worker steps for a back-off period. If other programs compete for the cores, it
-is four times the last period, halved for every HALF_LIFE_S of parallel steps since then; otherwise it is the minimum.
+After the timeout of a worker, a single worker steps for a back-off period. The period is the minimum, or longer if
+other programs compete for the cores: four times the last period, halved for every HALF_LIFE_S of parallel steps since
+then.
 """
 
 from __future__ import annotations
@@ -26,7 +27,7 @@ class Backoff:
 
     @property
     def is_active(self) -> bool:
-        """Whether a single worker is to step."""
+        """Whether a back-off period lasts, in which a single worker steps."""
         return time.perf_counter() < self._until
 
     def start_launch(self) -> None:

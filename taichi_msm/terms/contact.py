@@ -1,6 +1,6 @@
 """Contact, friction and grips of position-controlled tools. Scene: `probes` with `path`.
 
-After each step, mass points that are neither fixed nor held are projected out of the tools' shapes, in the order of
+After each step, free mass points (neither fixed nor held) are projected out of the shapes of the tools, in the order of
 the probes. With the displacement u after the step, the tip c of a tool, and the depth and normal n of X + u - c in its
 shape (`taichi_msm.shapes`), the correction is
 
@@ -8,16 +8,15 @@ shape (`taichi_msm.shapes`), the correction is
     with friction mu:    w = the part of (u + correction - u_before) - (c - c_before) perpendicular to n
                          correction -= w min(1, mu depth / |w|)
 
-A grip holds the mass points that are within 1.5 radii of the tip's centre when it begins: u = u_then + c - c_then. A
-clamp, a tool of radius 0, holds its mass points from the start: u = c. In a step, a correction has the effect of the
-force m (1 + g h / 2) / h^2 times the correction (see `damping`). The sum of all corrections therefore yields the force
-of the tool.
+A grip holds the mass points within 1.5 radii of the tip's centre at its start: u = u_start + c - c_start. A clamp, a
+tool of radius 0, holds its mass points from the start of the run: u = c. A correction has the effect of a force, the
+correction times m (1 + g h / 2) / h^2 (see `damping`), so the summed corrections yield the force of the tool.
 
-At rest a tool can push a mass point that touches it but cannot pull it. Of the force F on the mass point, the tool
-therefore carries the part into the shape, min(F . n, 0) n; the remainder, tangential or outward, must vanish in
-equilibrium. The normals n are stored in the fields of corrections and are 0 where a mass point touches no tool. Held
-mass points, also those that stick to a rough tool, move with their tool, which carries their whole force. A mass point
-may touch several tools: their contact forces and corrections are found by projected Gauss-Seidel iteration.
+In quasi-static scenes a tool pushes the mass points that touch it and never pulls. It carries the part of their force F
+into its shape, min(F . n, 0) n; the remainder, tangential or outward, vanishes in equilibrium. The fields of
+corrections store the normals n, and 0 without contact. Held mass points, and those that stick to a rough tool, move
+with their tool, which carries their whole force. Projected Gauss-Seidel iteration finds the forces and corrections of
+several tools on one mass point.
 """
 
 # No `from __future__ import annotations` here: Taichi reads the annotations of a kernel.
@@ -61,8 +60,8 @@ LENGTH, RADIUS, FRICTION, INVERSE_AXIS, TOOL_COLUMNS = 13, 14, 15, 16, 18
 GRIP_IDLE, GRIP_BEGINS, GRIP_CONTINUES = 0.0, 1.0, 2.0
 
 # Fields: for every tool the three components of the summed corrections; with grips, the index of the tool that holds a
-# mass point plus 1, and the displacement of the mass point when the grip began. Of mass points that stick to a rough
-# tool (`contact_rest`) the index is larger by the number of tools, and the displacement is that relative to the tool.
+# mass point plus 1, and the displacement of the mass point when the grip began. For mass points that stick to a rough
+# tool (`contact_rest`): the index plus 1 plus the number of tools, and the displacement relative to the tool.
 CORRECTIONS, HOLDER, HOLD_DISPLACEMENT = 3, 0, 1
 
 

@@ -1,7 +1,8 @@
-"""Laws of springs: force, tangent and energy by the elongation, in plain arithmetic.
+"""Laws of springs: force, tangent and energy as functions of the relative elongation.
 
-A spring of stiffness k whose length L0 becomes L pulls with k L0 f(e), where e = (L - L0) / L0 and f'(0) = 1; f is its
-law. NumPy calls the functions of a law as they are, and kernels call them wrapped by `KernelConfig.compile_law`.
+A spring of stiffness k [N/m], length L and rest length L0 [m] pulls with the force k L0 f(e) [N]. Its law f, with
+f'(0) = 1, is a function of the relative elongation e = (L - L0) / L0. NumPy calls the functions of a law directly, and
+kernels call them after `KernelConfig.compile_law`.
 
 With q = u_P - u_Q and the vector o from Q to P at rest, the force of P on its neighbour Q is k L0 f(e) (o + q) / L, and
 for f(e) = e
@@ -10,21 +11,21 @@ for f(e) = e
 
 This form avoids cancellation for small displacements of a large sheet.
 
-Under a pretension each spring has the tension tau L at rest, L0 is its length at rest, and the tensions cancel at every
-mass point. Without them, the force of a spring is
+Under a pretension each spring has the tension tau L0 at rest, and the rest tensions cancel at every mass point. Without
+the rest tension, the force of a spring is
 
     (k - tau) (1 - L0 / L) (o + q) + tau q + k L0 (f(e) - e) (o + q) / L
 
 and twice its energy is (k - tau) (L - L0)^2 + tau q^2, plus k L0^2 times twice the integral of f(e) - e.
 
-The stiffness of tissue that locks (`lock` and `factor` in the scene) grows with the elongation, up to a factor. With
-x = e / m for the lock m, and x0 = 1 - factor^(-1/2),
+The locking law (`lock` and `factor` in the scene) has a tangent that grows with e from 1 to `factor`. With the lock m,
+x = e / m and x0 = 1 - factor^(-1/2),
 
     f(e) = e                        for e <= 0
     f(e) = e / (1 - x)              for 0 < x <= x0, where the tangent (1 - x)^-2 reaches `factor`
 
-and beyond x0 f is straight with the slope `factor`. A spring locks when it is stretched by m; the foundation when it is
-pressed in by m, an elongation w = -u_z of length 1.
+and f is linear with the slope `factor` for x > x0. The lock m is a strain for springs. For the foundation it is a depth
+[m], with e = -u_z.
 """
 
 # No `from __future__ import annotations` here: Taichi reads the functions of a law.
@@ -47,12 +48,12 @@ class LawFunctions(NamedTuple):
     Attributes:
         pull: pull(k, tau, square_difference, square, length, *parameters), the force divided by L, without tau q [N/m].
         derivatives: derivatives(k, tau, square_difference, square, length, along, *parameters) returns s, w, and the
-            derivatives of `pull` with respect to k and tau. A displacement p of an end, with along = (o + q) . p,
-            changes the force by s p + w (o + q), without tau p.
+            derivatives of `pull` with respect to k and tau. A change p of q, with along = (o + q) . p, changes the
+            force by s p + w (o + q), without tau p.
         parameter_derivatives: parameter_derivatives(k, tau, square_difference, square, length, *parameters), the
             derivatives of `pull` with respect to the logarithm of the lock and to the factor.
-        energy: energy(k, tau, share, *parameters) for share = (L^2 - L0^2) / L0^2, twice the energy divided by
-            L0^2, without tau q^2 [N/m].
+        energy: energy(k, tau, square_strain, *parameters) with square_strain = (L^2 - L0^2) / L0^2, twice the energy
+            divided by L0^2, without tau q^2 [N/m].
     """
 
     pull: Callable[..., Any]
@@ -62,7 +63,7 @@ class LawFunctions(NamedTuple):
 
 
 class Law(ABC):
-    """A law, as a frozen dataclass without coefficients."""
+    """Law of springs: a frozen dataclass without fields."""
 
     parameter_count: ClassVar[int] = 0  # number of parameters of a spring
 
@@ -72,7 +73,7 @@ class Law(ABC):
 
         Args:
             operations: operations of NumPy or Taichi.
-            tense: whether the springs have a tension at rest; otherwise `pull` ignores tau, which is 0.
+            tense: whether the springs have a tension at rest; if not, tau is 0 and `pull` ignores it.
         """
 
 
@@ -87,19 +88,19 @@ class LinearLaw(Law):
             return k * square_difference / (square + length * sqrt(square))
 
         def derivatives(k, tau, square_difference, square, length, along):
-            both = square + length * sqrt(square)
+            divisor = square + length * sqrt(square)
             # One division instead of two.
-            inverse = 1 / (square * both)
-            share = square_difference * square * inverse
-            return k * share, k * ((1 - share) * both * inverse * along), share, 0 * share
+            inverse = 1 / (square * divisor)
+            relative = square_difference * square * inverse  # (L - L0) / L
+            return k * relative, k * ((1 - relative) * divisor * inverse * along), relative, 0 * relative
 
         def parameter_derivatives(k, tau, square_difference, square, length):
             return 0 * k, 0 * k
 
-        def energy(k, tau, share):
-            # L / L0 - 1; rounding can make `share` smaller than -1.
-            stretch = share / (1 + sqrt(maximum(share + 1, 0)))
-            return stretch * stretch * k
+        def energy(k, tau, square_strain):
+            # Rounding can make `square_strain` smaller than -1.
+            e = square_strain / (1 + sqrt(maximum(square_strain + 1, 0)))
+            return e * e * k
 
         return LawFunctions(pull, derivatives, parameter_derivatives, energy)
 
@@ -116,19 +117,19 @@ class LockingFunctions(NamedTuple):
 
 
 def build_locking(operations: Operations) -> LockingFunctions:
-    """Build the functions of the law that locks, for NumPy or Taichi."""
+    """Build the functions of the locking law, for NumPy or Taichi."""
     log, maximum, minimum, where = operations.log, operations.maximum, operations.minimum, operations.where
 
-    def secant(x, end):
-        inner, beyond = minimum(maximum(x, 0), end), maximum(x, end)
-        return (beyond - inner * end) / ((1 - inner) * (1 - inner) * beyond)
+    def secant(x, x0):
+        inner, beyond = minimum(maximum(x, 0), x0), maximum(x, x0)
+        return (beyond - inner * x0) / ((1 - inner) * (1 - inner) * beyond)
 
-    def tangent(x, end):
-        inner = minimum(maximum(x, 0), end)
+    def tangent(x, x0):
+        inner = minimum(maximum(x, 0), x0)
         return 1 / ((1 - inner) * (1 - inner))
 
-    def energy(x, end):
-        inner = minimum(maximum(x, 0), end)
+    def energy(x, x0):
+        inner = minimum(maximum(x, 0), x0)
         # -inner - log(1 - inner) = y^2 (2 - inner) + 2 (atanh(y) - y), which avoids cancellation.
         y = inner / (2 - inner)
         square, unit = y * y, 1 + 0 * y
@@ -142,7 +143,7 @@ def build_locking(operations: Operations) -> LockingFunctions:
 
 
 def make_stiffening(lock: float | None, factor: float) -> LockNumbers | None:
-    """Return the parameters of a law that locks; None for a linear law.
+    """Return the parameters of the locking law; None for a linear law.
 
     Args:
         lock: strain m of springs, or depth m of a foundation [m]; None for a linear law.
@@ -165,7 +166,7 @@ def law_parameters(stiffening: LockNumbers | None, length: float) -> tuple[float
 
 @dataclass(frozen=True)
 class LockingLaw(Law):
-    """The law of springs that lock, with the parameters 1 / (m L0), x0 and m."""
+    """Locking law, with the parameters 1 / (m L0), x0 and m."""
 
     parameter_count: ClassVar[int] = 3
 
@@ -173,48 +174,48 @@ class LockingLaw(Law):
         sqrt, maximum, minimum = operations.sqrt, operations.maximum, operations.minimum
         secant, tangent, integral = (operations.wrap(function) for function in build_locking(operations))
 
-        def pull(k, tau, square_difference, square, length, scale, end, lock):
-            # As `secant`, with one division for all. That x has an error of rounding / m does not matter here.
+        def pull(k, tau, square_difference, square, length, scale, x0, lock):
+            # `secant` inlined, with a single division. The rounding error of x, divided by m, is harmless here.
             root = sqrt(square)
             x = (root - length) * scale
-            inner, beyond = minimum(maximum(x, 0), end), maximum(x, end)
+            inner, beyond = minimum(maximum(x, 0), x0), maximum(x, x0)
             divisor = (1 - inner) * (1 - inner) * beyond
             return (
                 square_difference
-                * ((k + tau) * (beyond - inner * end) - tau * divisor)
+                * ((k + tau) * (beyond - inner * x0) - tau * divisor)
                 / ((square + length * root) * divisor)
             )
 
-        def pull_untensed(k, tau, square_difference, square, length, scale, end, lock):
+        def pull_untensed(k, tau, square_difference, square, length, scale, x0, lock):
             root = sqrt(square)
             x = (root - length) * scale
-            inner, beyond = minimum(maximum(x, 0), end), maximum(x, end)
+            inner, beyond = minimum(maximum(x, 0), x0), maximum(x, x0)
             divisor = (square + length * root) * ((1 - inner) * (1 - inner) * beyond)
-            return k * square_difference * (beyond - inner * end) / divisor
+            return k * square_difference * (beyond - inner * x0) / divisor
 
-        def derivatives(k, tau, square_difference, square, length, along, scale, end, lock):
+        def derivatives(k, tau, square_difference, square, length, along, scale, x0, lock):
             root = sqrt(square)
-            share = square_difference / (square + length * root)
-            x = share * root * scale
-            ratio = secant(x, end)
-            isotropic = share * ((k + tau) * ratio - tau)
-            axial = ((k + tau) * tangent(x, end) - tau - isotropic) / square * along
-            return isotropic, axial, share * ratio, share * (ratio - 1)
+            relative = square_difference / (square + length * root)  # (L - L0) / L
+            x = relative * root * scale
+            ratio = secant(x, x0)
+            isotropic = relative * ((k + tau) * ratio - tau)
+            axial = ((k + tau) * tangent(x, x0) - tau - isotropic) / square * along
+            return isotropic, axial, relative * ratio, relative * (ratio - 1)
 
-        def parameter_derivatives(k, tau, square_difference, square, length, scale, end, lock):
+        def parameter_derivatives(k, tau, square_difference, square, length, scale, x0, lock):
             root = sqrt(square)
-            share = square_difference / (square + length * root)
-            x = share * root * scale
-            by_lock = (k + tau) * share * (secant(x, end) - tangent(x, end))
-            return by_lock, (k + tau) * maximum(share - end / (scale * root), 0)
+            relative = square_difference / (square + length * root)  # (L - L0) / L
+            x = relative * root * scale
+            by_lock = (k + tau) * relative * (secant(x, x0) - tangent(x, x0))
+            return by_lock, (k + tau) * maximum(relative - x0 / (scale * root), 0)
 
-        def energy(k, tau, share, scale, end, lock):
-            stretch = share / (1 + sqrt(maximum(share + 1, 0)))
-            return (k + tau) * (lock * lock) * integral(stretch / lock, end) - tau * stretch * stretch
+        def energy(k, tau, square_strain, scale, x0, lock):
+            e = square_strain / (1 + sqrt(maximum(square_strain + 1, 0)))
+            return (k + tau) * (lock * lock) * integral(e / lock, x0) - tau * e * e
 
         return LawFunctions(pull if tense else pull_untensed, derivatives, parameter_derivatives, energy)
 
 
 def spring_law(stiffening: LockNumbers | None) -> Law:
-    """Return `LockingLaw`, or `LINEAR` without stiffening."""
+    """Return the law of springs: `LINEAR` if `stiffening` is None, otherwise `LockingLaw`."""
     return LINEAR if stiffening is None else LockingLaw()

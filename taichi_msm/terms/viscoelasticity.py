@@ -1,15 +1,16 @@
 """Stress relaxation: quasi-linear viscoelasticity (Fung) of all elastic forces. Scene: `tissue.relaxation`.
 
-Let f_n be the force of springs, bending and foundation on a mass point at step n, and h the step. Every branch has a
-share and a time, x_i = h / time_i and phi_i = (1 - exp(-x_i)) / x_i. With G, the sum of the shares, the force
+Let f_n be the elastic force (springs, bending, foundation) on a mass point at step n, h the step [s], share_i and
+time_i [s] the parameters of branch i, and G the sum of the shares. With x_i = h / time_i and phi_i = (1 - exp(-x_i)) /
+x_i, the force
 
     (1 - G) f_n + sum of (s_i + share_i phi_i f_n)
 
-acts in place of f_n, and then s_i becomes exp(-x_i) s_i - share_i phi_i (1 - exp(-x_i)) f_n. Initially s_i = 0. This is
-exact for forces that are linear in time between the steps.
+acts in place of f_n. The memory s_i, initially 0, then becomes exp(-x_i) s_i - share_i phi_i (1 - exp(-x_i)) f_n. This
+is exact for forces that are linear in time between the steps.
 
-In quasi-static scenes h is the time between frames, and the memory s_i changes at frames only. Frame 0 takes f as it
-is, and then s_i = share_i (exp(-x_i) - phi_i) f.
+In quasi-static scenes h is the time between frames, and the memory s_i changes at frames only. In frame 0 the full f
+acts, and then s_i = share_i (exp(-x_i) - phi_i) f.
 """
 
 # No `from __future__ import annotations` here: Taichi reads the annotations of a kernel.
@@ -27,14 +28,14 @@ from taichi_msm.model.plan import Plan
 from taichi_msm.scene.scene import Scene
 from taichi_msm.terms.base import KernelConfig, Term
 
-# Columns of the load table: the factor of f; at rest, whether the memory changes; for each branch g = 1 - exp(-x) and
-# c, with which s decreases by g (s + c f). In f32, exp(-x) itself would lose the digits of a small x.
+# Columns of the load table: the factor of f; in quasi-static scenes, whether the memory changes; for each branch,
+# g = 1 - exp(-x) and c = share phi: s decreases by g (s + c f). In f32, exp(-x) would lose the digits of a small x.
 FACTOR, UPDATE, BRANCHES, BRANCH_COLUMNS = 0, 1, 2, 2
 
 
 @dataclass(frozen=True)
 class ViscoelasticTerm(Term):
-    """Stress relaxation. It changes the sum of the elastic forces, so it follows them in `terms.TERMS`."""
+    """Stress relaxation of the sum of the elastic forces, whose terms precede it in `terms.TERMS`."""
 
     key: ClassVar[str] = "tissue.relaxation"
 
