@@ -12,6 +12,7 @@ from contextlib import ExitStack, asynccontextmanager, suppress
 from functools import wraps
 from io import BytesIO
 from pathlib import Path
+from time import monotonic
 from typing import Any, ClassVar
 
 import numpy as np
@@ -86,10 +87,12 @@ class Client:
         return state
 
     async def until(self, met: Callable[[dict[str, Any]], bool]) -> dict[str, Any]:
-        """Read until a state meets a condition."""
-        while True:
+        """Read until a state meets a condition, for at most WAIT_S."""
+        deadline = monotonic() + WAIT_S
+        while monotonic() < deadline:
             if (state := await self.read()) and met(state):
                 return state
+        raise TimeoutError
 
 
 async def connect(server: Server, **headers: str) -> Client:
@@ -216,14 +219,13 @@ async def test_page_changes_the_material(session: Session) -> None:
         stiff = (await client.until(lambda after: after["time"] > state["time"] + 0.8))["readings"][-1][2]
         assert 0 < stiff < 0.9 * soft
         for message, notice in (
-            (("key", "w"), "material changed"),
+            (("key", "w"), "changed material"),
             (("material", "springs.structural", 1e9), "springs.structural"),
             (("key", "r"), ""),
             (("key", "w"), "session-1"),
         ):
             await client.send(*message)
-            while notice not in (await client.until(lambda state: True))["notice"]:
-                pass
+            await client.until(lambda state, notice=notice: notice in state["notice"])
         springs = load_scene("captures/session-1.yaml").springs
         assert springs is not None
         assert springs.structural == 160
