@@ -9,7 +9,7 @@ import re
 import signal
 from collections.abc import AsyncIterator, Callable, Coroutine, Iterator
 from contextlib import ExitStack, asynccontextmanager, suppress
-from functools import wraps
+from functools import partial, wraps
 from io import BytesIO
 from pathlib import Path
 from time import monotonic
@@ -204,6 +204,10 @@ async def test_one_page_steers(session: Session) -> None:
         assert session.frame == frame, "without a page the session waits"
 
 
+def shows(notice: str, state: dict[str, Any]) -> bool:
+    return notice in state["notice"]
+
+
 @scenario
 async def test_page_changes_the_material(session: Session) -> None:
     async with served(session) as server:
@@ -225,7 +229,7 @@ async def test_page_changes_the_material(session: Session) -> None:
             (("key", "w"), "session-1"),
         ):
             await client.send(*message)
-            await client.until(lambda state, notice=notice: notice in state["notice"])
+            await client.until(partial(shows, notice))
         springs = load_scene("captures/session-1.yaml").springs
         assert springs is not None
         assert springs.structural == 160
