@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -33,7 +34,7 @@ class Diagnosis:
     last_sound_state: Snapshot | None
 
 
-def diagnose(dynamics: SheetSolver, start: Snapshot | None, pause: Pause) -> Diagnosis:
+def diagnose(dynamics: SheetSolver[Any], start: Snapshot | None, pause: Pause) -> Diagnosis:
     """Find the step, the mass point and the likely cause of a divergence within the current frame.
 
     Args:
@@ -81,7 +82,7 @@ def diagnose(dynamics: SheetSolver, start: Snapshot | None, pause: Pause) -> Dia
     return Diagnosis(message, last_sound_state)
 
 
-def _likely_cause(dynamics: SheetSolver, bad_step: int, point: tuple[int, int], pause: Pause) -> str:
+def _likely_cause(dynamics: SheetSolver[Any], bad_step: int, point: tuple[int, int], pause: Pause) -> str:
     """Describe the likely cause: the time step if the run with a finer one is sound, else a force or a path."""
     plan, grid = dynamics.plan, dynamics.plan.grid
     frames, finest_step = -(-bad_step // grid.steps_per_frame), math.inf
@@ -108,7 +109,7 @@ def _likely_cause(dynamics: SheetSolver, bad_step: int, point: tuple[int, int], 
     return f"{cause}; take less, or a time.step below {grid.step:.6g} s; finer steps would take too long to try here"
 
 
-def _is_stable(dynamics: SheetSolver, plan: Plan, frames: int, pause: Pause) -> bool:
+def _is_stable(dynamics: SheetSolver[Any], plan: Plan, frames: int, pause: Pause) -> bool:
     """Return whether the first frames of a plan, from rest, have no fault."""
     dynamics.restart(plan)
     monitor = DivergenceMonitor(plan)

@@ -155,8 +155,8 @@ def _sampling_force_error(scene: Scene) -> float:
 class MeshCompanion:
     """Companion runs in f64 on coarser meshes, compared with a run frame by frame.
 
-    The first is that of `mesh_companion_plan`; without position-controlled tools, a second one has half as many cells
-    per side.
+    The first one has the plan of `mesh_companion_plan`. Without position-controlled tools, a second one has half of its
+    cells per side.
 
     Args:
         plan: plan of the compared run.

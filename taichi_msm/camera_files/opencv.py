@@ -1,4 +1,4 @@
-"""Calibrations of one camera by OpenCV (YAML, XML, JSON) and ROS (camera_info), with keys as many scripts spell them.
+"""Calibrations of one camera by OpenCV (YAML, XML, JSON) and ROS (camera_info), with common spellings of their keys.
 
 The readers of other formats convert to these keys.
 """

@@ -45,7 +45,7 @@ def read_calibration(
         The calibration, lengths in metres.
 
     Raises:
-        CameraFileError: when the file is invalid or not supported; the message lists what was found.
+        CameraFileError: when the file is invalid or not supported; the message lists the keys of the file.
     """
     file = CameraFile(path, max_bytes=2**22)
     reader, cameras = next((reader, cameras) for reader in CALIBRATION_READERS if (cameras := reader.cameras(file)))

@@ -130,7 +130,7 @@ def _add_tools(glb: Glb, run: FinishedRun, positions: Array) -> None:
 
 
 def _add_cameras(glb: Glb, run: FinishedRun) -> list[str]:
-    """Add the cameras of the scene, with their motion; return warnings about what glTF cannot describe."""
+    """Add the cameras of the scene, with their motion; return warnings about properties without equivalent in glTF."""
     notes = []
     for name in run.scene.render.all_cameras:
         times = run.time.tolist() if is_moving(run.scene, name) else [0.0]

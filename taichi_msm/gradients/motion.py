@@ -45,9 +45,10 @@ Array = NDArray[np.float64]
 
 
 def _segment_steps(steps: int, step_bytes: int) -> int:
-    """Return the number of steps of a segment, for displacements that need as much memory as all checkpoints, or more.
+    """Return the number of steps of a segment.
 
-    A checkpoint is twice as large as the displacements of a step, `step_bytes`.
+    The memory of its displacements at least equals that of all checkpoints. A checkpoint has twice the size of the
+    displacements of a step, `step_bytes`.
     """
     return min(steps, max(math.ceil(math.sqrt(2 * steps)), SEGMENT_BYTES // step_bytes))
 

@@ -244,7 +244,7 @@ class Draft:
             self.problems.append((origin, problem))
 
     def resolve_path(self, key: Key, folder: Path) -> None:
-        """Make a path of the file relative to the current directory.
+        """Rewrite a path in the file to be relative to the current directory.
 
         Recorded as problems: a path outside the folder, except from an override, and a missing camera file.
 

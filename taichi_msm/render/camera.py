@@ -55,7 +55,7 @@ class View(NamedTuple):
     pinhole: bool  # whether the projection is perspective
     lens: Lens | None = None
     baseline: float = 0.0  # distance to the companion of a parallel stereo pair, along the x axis [m]
-    companion: View | None = None  # second camera of the stereo pair: the first one with this camera as `beside`
+    companion: View | None = None  # second camera of the stereo pair, whose key `beside` names this one
     light_view: View | None = None  # camera that carries the light; None if it is this camera
 
     @property

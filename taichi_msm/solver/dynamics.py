@@ -22,10 +22,8 @@ from taichi_msm.solver.arrays import InitialData, SheetLayout, StepKernel
 from taichi_msm.solver.contact_corrections import sum_corrections
 from taichi_msm.solver.kernel_cpu import ScatterKernel
 from taichi_msm.solver.kernel_gpu import STEPS_PER_LAUNCH, GatherKernel
-from taichi_msm.solver.planned_sheet import PlannedSheet
 from taichi_msm.solver.sheet_solver import SheetSolver
 from taichi_msm.solver.state import PeakForce, ProbeForces, Reading, State, TipForce
-from taichi_msm.system.runtime import Device
 from taichi_msm.terms.base import GAIN
 
 # Largest numbers of steps times mass points, about 0.1 s of one core, and of steps in a launch. Ctrl-C is handled only
@@ -39,52 +37,23 @@ STEPS_PER_TABLE = 4096
 Array = NDArray[np.float64]
 
 
-def _build_kernel(_: Plan, layout: SheetLayout, start: InitialData) -> StepKernel:
-    return (ScatterKernel if layout.workers else GatherKernel)(layout, start)
-
-
-class Dynamics(SheetSolver):
+class Dynamics(SheetSolver[StepKernel]):
     """The sheet in motion.
 
     An exception such as KeyboardInterrupt during a launch leaves the sheet inconsistent, because the number of steps
     taken is then unknown.
-
-    Args:
-        plan: plan of the run.
-        device: device of the arrays.
-        layout: replaces the layout chosen by `choose_layout`, for tests.
-        cores: largest number of CPU cores; by default all available cores.
-
-    Attributes:
-        sheet: the sheet in the memory of the device.
     """
 
-    def __init__(self, plan: Plan, device: Device, layout: SheetLayout | None = None, cores: int | None = None) -> None:
-        self.sheet = PlannedSheet(plan, _build_kernel, device, layout, cores)
-        self._begin(None)
-
-    @property
-    def plan(self) -> Plan:
-        return self.sheet.plan
-
-    @property
-    def layout(self) -> SheetLayout:
-        return self.sheet.layout
-
-    @property
-    def inconsistent(self) -> bool:
-        return self.sheet.inconsistent
-
-    def restart(self, plan: Plan, state: State | None = None) -> None:
-        self._begin(state)
-        self.sheet.restart(plan, state)
+    @staticmethod
+    def _build_kernel(plan: Plan, layout: SheetLayout, start: InitialData) -> StepKernel:  # noqa: ARG004
+        return (ScatterKernel if layout.workers else GatherKernel)(layout, start)
 
     def _begin(self, state: State | None) -> None:
-        self.steps_done = 0 if state is None else state.steps
+        super()._begin(state)
         self._first_tabled, self._loads = 0, np.empty((0, 0))
 
     def steer(self, plan: Plan) -> None:
-        self.sheet.steer(plan)
+        super().steer(plan)
         # A caller that steers usually steers again at the next frame, so the table has only the steps of one frame.
         self._tabulate(plan.grid.steps_per_frame)
 
@@ -122,9 +91,6 @@ class Dynamics(SheetSolver):
         self._require_consistent()
         return self.sheet.read(self.steps_done, moving=True)
 
-    def displacement(self) -> NDArray[Any]:
-        return self.read().displacement
-
     def tool_forces(self) -> NDArray[np.float64]:
         """Compute the mean force of each position-controlled tool since the previous frame [N], shape (tools, 3).
 
@@ -148,9 +114,6 @@ class Dynamics(SheetSolver):
         if first == 0:
             table[0, GAIN] = first_gain
         return table
-
-    def close(self) -> None:
-        self.sheet.close()
 
     def _require_consistent(self) -> None:
         if self.inconsistent:

@@ -35,7 +35,6 @@ from taichi_msm.scene.section import MIN_MAGNITUDE
 from taichi_msm.solver.arrays import InitialData, SheetLayout
 from taichi_msm.solver.dynamics import Dynamics
 from taichi_msm.solver.kernel_rest import Relaxation
-from taichi_msm.solver.planned_sheet import PlannedSheet
 from taichi_msm.solver.sheet_solver import SheetSolver
 from taichi_msm.solver.state import Reading, State, largest_displacement
 from taichi_msm.system.runtime import Device
@@ -55,54 +54,24 @@ MAX_EVALUATIONS = 2000
 Array = NDArray[np.float64]
 
 
-def _build_kernel(plan: Plan, layout: SheetLayout, start: InitialData) -> Relaxation:
-    # A mass point without stiffness would have mass 0.
-    return Relaxation(layout, start, np.maximum(fictitious_masses(plan), MIN_MAGNITUDE))
-
-
-class QuasiStatics(SheetSolver):
-    """The sheet in quasi-static motion.
-
-    Args:
-        plan: plan of the run.
-        device: device of the arrays, a CPU.
-        layout: replaces the layout chosen by `choose_layout`, for tests.
-        cores: accepted for the same interface as `Dynamics`; a single worker is used.
+class QuasiStatics(SheetSolver[Relaxation]):
+    """The sheet in quasi-static motion, stepped by a single worker of a CPU.
 
     Attributes:
-        sheet: the sheet in the memory of the device.
         evaluations: number of evaluations of the forces for the last frame.
         residual: largest residual force of the last frame, relative to the largest force.
     """
 
-    def __init__(self, plan: Plan, device: Device, layout: SheetLayout | None = None, cores: int | None = None) -> None:
-        self.sheet = PlannedSheet(plan, _build_kernel, device, layout, cores)
-        self._begin(None)
-
-    @property
-    def plan(self) -> Plan:
-        return self.sheet.plan
-
-    @property
-    def layout(self) -> SheetLayout:
-        return self.sheet.layout
-
-    @property
-    def inconsistent(self) -> bool:
-        return self.sheet.inconsistent
-
-    def restart(self, plan: Plan, state: State | None = None) -> None:
-        self._begin(state)
-        self.sheet.restart(plan, state)
+    @staticmethod
+    def _build_kernel(plan: Plan, layout: SheetLayout, start: InitialData) -> Relaxation:
+        # A mass point without stiffness would have mass 0.
+        return Relaxation(layout, start, np.maximum(fictitious_masses(plan), MIN_MAGNITUDE))
 
     def _begin(self, state: State | None) -> None:
-        self.steps_done = 0 if state is None else state.steps
+        super()._begin(state)
         self.evaluations, self.residual = 0, 0.0
         # Without a state the first call of `advance` also finds the first frame.
         self._last_frame, self._interrupted = state, False
-
-    def steer(self, plan: Plan) -> None:
-        self.sheet.steer(plan)
 
     def advance(self, steps: int, pause: Pause = lambda: None) -> None:
         """Find the equilibria of the next frames, and of the first frame if it is still missing.
@@ -140,16 +109,10 @@ class QuasiStatics(SheetSolver):
         reading = self.sheet.read(self.steps_done, moving=False)
         return reading._replace(residual=self.residual, evaluations=self.evaluations)
 
-    def displacement(self) -> NDArray[Any]:
-        return self.read().displacement
-
     def tool_forces(self) -> Array:
         touched, force = self._touched().astype(float), self.sheet.read_arrays(differences=True)[0]
         # Subtraction from 0 avoids -0.
         return 0.0 - np.einsum("tij,ijk->tk", touched, force)
-
-    def close(self) -> None:
-        self.sheet.close()
 
     def _touched(self) -> NDArray[np.bool_]:
         return contact_rest.touched_points(len(self.plan.tools), self._read_contact())
@@ -323,7 +286,7 @@ class QuasiStatics(SheetSolver):
 
 def build_dynamics(
     plan: Plan, device: Device, layout: SheetLayout | None = None, cores: int | None = None
-) -> SheetSolver:
+) -> SheetSolver[Any]:
     """Build the dynamic or quasi-static solver of a plan.
 
     Args:
