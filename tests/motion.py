@@ -17,7 +17,7 @@ from taichi_msm.runs.simulation import Simulation
 from taichi_msm.scene.scene import Scene
 from taichi_msm.solver.arrays import SheetLayout
 from taichi_msm.solver.dynamics import Dynamics
-from taichi_msm.solver.planned_sheet import choose_layout
+from taichi_msm.solver.sheet_solver import choose_layout
 from taichi_msm.solver.state import RunProgress
 from taichi_msm.system.runtime import Device
 from tests.scenes import plan_of

@@ -7,7 +7,7 @@ from dataclasses import replace
 from benchmarks.process import vector_bits
 from benchmarks.stepping.problem import Problem, Stepper
 from taichi_msm.solver.dynamics import Dynamics
-from taichi_msm.solver.planned_sheet import choose_layout
+from taichi_msm.solver.sheet_solver import choose_layout
 from taichi_msm.system import runtime
 
 

@@ -208,7 +208,7 @@ class MotionAdjoint:
         return np.array([work[int(first == 0) :].sum(), work[: int(first == 0)].sum()])
 
     def _store_checkpoint(self, segment: int) -> None:
-        sheet, first = self._forward.sheet.kernel.arrays, segment * self._step_entries
+        sheet, first = self._forward.kernel.arrays, segment * self._step_entries
         self._copy_step(0, first, sheet.u, self._checkpoints)
         self._copy_step(0, first, sheet.d, self._checkpoint_differences)
 
@@ -298,7 +298,7 @@ class MotionAdjoint:
 
     @property
     def _sheet_arrays(self) -> tuple[Any, ...]:
-        arrays = self._forward.sheet.kernel.arrays
+        arrays = self._forward.kernel.arrays
         return arrays.constants, arrays.by_column, arrays.stiffness, arrays.fields
 
     def _max_launch_steps(self) -> int:

@@ -67,36 +67,36 @@ class Dynamics(SheetSolver[StepKernel]):
         self._require_consistent()
         # The forces of tools at a frame are means over the steps since the previous frame.
         if steps and self.steps_done % self.plan.grid.steps_per_frame == 0:
-            sum_corrections(self.layout, self.sheet.kernel.arrays, clear=True)
+            sum_corrections(self.layout, self.kernel.arrays, clear=True)
         end = self.steps_done + steps
         while self.steps_done < end:
             count = min(max_steps, end - self.steps_done)
-            self.sheet.inconsistent = True
-            self.sheet.kernel.advance(count, self._next_loads(count))
+            self.inconsistent = True
+            self.kernel.advance(count, self._next_loads(count))
             self.steps_done += count
-            self.sheet.inconsistent = False
+            self.inconsistent = False
             pause()
 
     def compile(self) -> None:
-        self.sheet.kernel.compile(self._next_loads(1))
+        self.kernel.compile(self._next_loads(1))
         self.displacement()
         self.tool_forces()
 
     def state(self) -> State:
         self._require_consistent()
-        u, d = (self.sheet.read_arrays(differences=differences)[0] for differences in (False, True))
-        return State(self.steps_done, u, d, self.sheet.read_memory())
+        u, d = (self._read_arrays(differences=differences)[0] for differences in (False, True))
+        return State(self.steps_done, u, d, self._read_memory())
 
     def read(self) -> Reading:
         self._require_consistent()
-        return self.sheet.read(self.steps_done, moving=True)
+        return self._measure(moving=True)
 
     def tool_forces(self) -> NDArray[np.float64]:
         """Compute the mean force of each position-controlled tool since the previous frame [N], shape (tools, 3).
 
         It has the effect of the contact corrections (`verlet.mean_force`), summed over mass points.
         """
-        sums = sum_corrections(self.layout, self.sheet.kernel.arrays, clear=False)
+        sums = sum_corrections(self.layout, self.kernel.arrays, clear=False)
         return mean_force(self.plan, sums, self.plan.grid.steps_per_frame)
 
     def step_table(self, first: int, count: int) -> NDArray[Any]:
@@ -109,7 +109,7 @@ class Dynamics(SheetSolver[StepKernel]):
         Returns:
             Load table, shape (count, columns).
         """
-        table = self.sheet.load_table(average_loads(self.plan, first, count), first)
+        table = self._load_table(average_loads(self.plan, first, count), first)
         _, table[:, GAIN], first_gain = coefficients(self.plan)
         if first == 0:
             table[0, GAIN] = first_gain

@@ -88,13 +88,13 @@ class QuasiStatics(SheetSolver[Relaxation]):
             frame = self.steps_done + (self._last_frame is not None)
             self._settle(frame, pause)
             self.steps_done = frame
-            displacement = self.sheet.read_arrays(differences=False)[0]
-            self._last_frame = State(frame, displacement, np.zeros_like(displacement), self.sheet.read_memory())
+            displacement = self._read_arrays(differences=False)[0]
+            self._last_frame = State(frame, displacement, np.zeros_like(displacement), self._read_memory())
 
     def compile(self) -> None:
-        row = self.sheet.load_table(evaluate_frame_loads(self.plan, 0), 0)
-        self.sheet.kernel.relax(0, 0.0, row)
-        self.sheet.kernel.scale(row)
+        row = self._load_table(evaluate_frame_loads(self.plan, 0), 0)
+        self.kernel.relax(0, 0.0, row)
+        self.kernel.scale(row)
         self.displacement()
 
     def state(self) -> State:
@@ -106,11 +106,11 @@ class QuasiStatics(SheetSolver[Relaxation]):
         return State(0, np.zeros((*shape, 3)), np.zeros((*shape, 3)), memory)
 
     def read(self) -> Reading:
-        reading = self.sheet.read(self.steps_done, moving=False)
+        reading = self._measure(moving=False)
         return reading._replace(residual=self.residual, evaluations=self.evaluations)
 
     def tool_forces(self) -> Array:
-        touched, force = self._touched().astype(float), self.sheet.read_arrays(differences=True)[0]
+        touched, force = self._touched().astype(float), self._read_arrays(differences=True)[0]
         # Subtraction from 0 avoids -0.
         return 0.0 - np.einsum("tij,ijk->tk", touched, force)
 
@@ -122,14 +122,14 @@ class QuasiStatics(SheetSolver[Relaxation]):
         return self.layout.config.first_column(ContactTerm)
 
     def _read_contact(self) -> Array:
-        return self.sheet.read_memory()[self.layout.config.memory_slice(ContactTerm)]
+        return self._read_memory()[self.layout.config.memory_slice(ContactTerm)]
 
     def _write_contact(self, memory: Array) -> None:
-        self.sheet.kernel.arrays.set_fields(self.layout.config.first_field(ContactTerm), memory)
+        self.kernel.arrays.set_fields(self.layout.config.first_field(ContactTerm), memory)
 
     def _settle(self, frame: int, pause: Pause) -> None:
         self.evaluations = 0
-        relaxation, before, loads = self.sheet.kernel, self.state(), evaluate_frame_loads(self.plan, frame)
+        relaxation, before, loads = self.kernel, self.state(), evaluate_frame_loads(self.plan, frame)
         tools, contact_before = self.plan.tools, before.memory[self.layout.config.memory_slice(ContactTerm)]
         contact = contact_rest.memory_after_grips(self.plan, frame, before.displacement, contact_before)
         held_before, held = contact_rest.is_gripping(tools, contact_before), contact_rest.is_gripping(tools, contact)
@@ -140,7 +140,7 @@ class QuasiStatics(SheetSolver[Relaxation]):
         self._interrupted, residual, rough = True, 0.0, any(tool.rough for tool in tools)
         *_, end = times = self._shape_times(frame)
         for start, time in pairwise(times):
-            row = self.sheet.load_table(loads, frame)
+            row = self._load_table(loads, frame)
             contact_rest.set_tools(self.plan, frame, time, row[0, self._contact_column :])
             # After a release the flat shape is tried even if a tool is in the way.
             free = not (loads.strength.any() or held or self._is_clamp_displaced(time))
@@ -161,17 +161,17 @@ class QuasiStatics(SheetSolver[Relaxation]):
         config = self.layout.config
         changing = [term for term in config.terms if term.mark_update(row[0, config.first_column(type(term)) :])]
         if changing:
-            self.sheet.kernel.relax(1, math.inf, row)
+            self.kernel.relax(1, math.inf, row)
 
     def _stick(self, frame: int, times: tuple[float, float], row: NDArray[Any], pause: Pause) -> None:
         """Let the mass points stick that rough tools reach between the current shape and the next one."""
-        plan, memory, start = self.plan, self._read_contact(), self.sheet.read_arrays(differences=False)[0]
+        plan, memory, start = self.plan, self._read_contact(), self._read_arrays(differences=False)[0]
         after = contact_rest.stick(plan, memory, start, start, times)
         if contact_rest.stuck_points(plan, memory).any() and (after != memory).any():
             # To second order, mass points move as on a sheet that no further tool touches until they stick.
             smooth = contact_rest.without_rough_tools(plan, row, self._contact_column)
             self._relax(frame, smooth, PERTURBATION_TOLERANCE, pause)
-            after = contact_rest.stick(plan, memory, start, self.sheet.read_arrays(differences=False)[0], times)
+            after = contact_rest.stick(plan, memory, start, self._read_arrays(differences=False)[0], times)
         self._write_contact(after)
 
     def _balance(self, frame: int, row: NDArray[Any], tolerance: float, pause: Pause, *, free: bool) -> float:
@@ -183,15 +183,15 @@ class QuasiStatics(SheetSolver[Relaxation]):
     def _release(self, time: float, row: NDArray[Any], tolerance: float) -> float:
         """Release mass points on which rough tools pull by more than a tolerance; return the largest relative pull."""
         memory = self._read_contact()
-        shape, force = (self.sheet.read_arrays(differences=forces)[0] for forces in (False, True))
+        shape, force = (self._read_arrays(differences=forces)[0] for forces in (False, True))
         pulls = contact_rest.compute_pulls(self.plan, memory, shape, force, time)
-        largest = float(pulls.max()) / max(MIN_FORCE_N, self.sheet.kernel.scale(row))
+        largest = float(pulls.max()) / max(MIN_FORCE_N, self.kernel.scale(row))
         if largest > tolerance:
             self._write_contact(contact_rest.release(self.plan, memory, pulls))
         return largest
 
     def _meets_tool(self, time: float) -> bool:
-        position = rest_positions(self.plan.scene.sheet) + self.sheet.read_arrays(differences=False)[0]
+        position = rest_positions(self.plan.scene.sheet) + self._read_arrays(differences=False)[0]
         return any(tool.touches(position[~self.plan.fixed], time) for tool in self.plan.tools)
 
     def _is_clamp_displaced(self, time: float) -> bool:
@@ -200,7 +200,7 @@ class QuasiStatics(SheetSolver[Relaxation]):
 
     def _try_flat(self, row: NDArray[Any]) -> bool:
         """Return whether the flat shape is an equilibrium; if so, keep it."""
-        relaxation, shape = self.sheet.kernel, self.sheet.read_arrays(differences=False)[0]
+        relaxation, shape = self.kernel, self._read_arrays(differences=False)[0]
         relaxation.place(np.zeros_like(shape))
         count, force = relaxation.relax(1, 0.0, row)
         self.evaluations += count
@@ -217,7 +217,7 @@ class QuasiStatics(SheetSolver[Relaxation]):
 
     def _relax(self, frame: int, row: NDArray[Any], tolerance: float, pause: Pause) -> float:
         """Iterate until the residual, relative to the largest force, is below a tolerance; return it."""
-        relaxation, longer = self.sheet.kernel, max(self.layout.rows, self.layout.cols)
+        relaxation, longer = self.kernel, max(self.layout.rows, self.layout.cols)
         relaxation.stop()
         # About 0.1 s of one core at most.
         per_launch = max(1, min(64, 40_000_000 // (self.layout.rows * self.layout.cols)))
@@ -263,12 +263,12 @@ class QuasiStatics(SheetSolver[Relaxation]):
         rows, cols = self.layout.rows, self.layout.cols
         # This generator returns the same numbers in every version of NumPy.
         noise = 2 * np.random.RandomState(0).random_sample((rows, cols, 3)) - 1
-        moves = (~self.plan.fixed / self.sheet.kernel.masses)[..., None]
-        self.sheet.kernel.place(self.sheet.read_arrays(differences=False)[0] + force * noise * moves)
+        moves = (~self.plan.fixed / self.kernel.masses)[..., None]
+        self.kernel.place(self._read_arrays(differences=False)[0] + force * noise * moves)
 
     def _diverged(self, frame: int, residual: float, evaluations: int) -> DivergedError:
         plan, time = self.plan, frame / self.plan.grid.frames_per_second
-        row, column, *_ = largest_displacement(self.sheet.read_arrays(differences=True)[0])
+        row, column, *_ = largest_displacement(self._read_arrays(differences=True)[0])
         remedy = (
             "the sheet may hang slack, fold or wrinkle; give it a foundation, pretension or bending, or take less load"
         )

@@ -1,19 +1,74 @@
-"""The common part of both solvers of a sheet: in motion (`dynamics`) and in quasi-static equilibrium (`rest`)."""
+"""The common part of both solvers of a sheet: in motion (`dynamics`) and in quasi-static equilibrium (`rest`).
+
+It holds the arrays of a plan on a device, computes the load table of their steps, and reads and measures them.
+"""
 
 from __future__ import annotations
 
+import math
 from abc import ABC, abstractmethod
-from typing import Any, Generic
+from typing import Any, Generic, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
-from taichi_msm.errors import Pause
+from taichi_msm.errors import ArgumentError, DeviceError, MsmError, Pause
+from taichi_msm.model.loads import Schedule
 from taichi_msm.model.plan import Plan
-from taichi_msm.solver.arrays import InitialData, SheetLayout
-from taichi_msm.solver.planned_sheet import Kernel, PlannedSheet
+from taichi_msm.model.sheet import area_shares, axes, spacing
+from taichi_msm.solver.arrays import NUMBER_BYTES, InitialData, SheetKernel, SheetLayout
 from taichi_msm.solver.state import Reading, State
-from taichi_msm.system.runtime import Device
+from taichi_msm.system.process import available_threads
+from taichi_msm.system.runtime import Device, lanes
+from taichi_msm.terms import base, build_terms
+from taichi_msm.terms.loads import ProbeTerm, decay_parameters
+from taichi_msm.terms.springs import MAX_STRAIN, MIN_STRAIN, SpringTerm
+
+Kernel = TypeVar("Kernel", bound=SheetKernel)
+
+# With fewer mass points per worker, an additional worker costs more waiting time than it saves.
+POINTS_PER_WORKER = 450
+
+
+def choose_layout(plan: Plan, device: Device, cores: int | None = None) -> SheetLayout:
+    """Choose the memory layout of a sheet, its division among workers, and the configuration of its kernels.
+
+    Args:
+        plan: plan of the run.
+        device: device of the arrays.
+        cores: largest number of CPU cores; by default all available cores.
+
+    Returns:
+        Layout of the sheet.
+
+    Raises:
+        DeviceError: when the device does not support the scene.
+    """
+    (rows, cols), fixed, precision = plan.scene.sheet.points, plan.fixed, plan.grid.precision
+    fixed_rows = bool(fixed[0].all()), bool(fixed[-1].all())
+    if plan.scene.time.at_rest:
+        if device.arch != "cpu":
+            raise DeviceError(f"--arch {device.arch}: time.motion: quasistatic runs on a CPU only; take --arch cpu")
+        workers = 1
+    elif device.arch == "cpu":
+        # Workers wait by spinning, so more workers than cores would delay each other.
+        cores = min(device.threads, available_threads() if cores is None else cores)
+        workers = max(1, min(cores, rows * cols // POINTS_PER_WORKER, (rows - sum(fixed_rows)) // 2))
+    else:
+        workers = 0
+    config = base.KernelConfig(
+        precision, lanes(precision), plan.open_edges and plan.material.by_area, build_terms(plan)
+    )
+    if device.arch == "vulkan" and precision == "f64" and any(slot.moves for slot in plan.slots):
+        raise DeviceError(
+            "--arch vulkan: has no exp in f64, which control points that move need; take time.precision: f32 without a "
+            "tolerance or an estimate of the error, or --arch cpu"
+        )
+    # A pass over a band that exceeds the cache takes several steps while its rows are there. Per mass point it reads
+    # displacement, last difference and carried force, with three components each.
+    fits = workers == 0 or rows // workers * cols * 9 * NUMBER_BYTES[precision] <= 3 << 17
+    depth = 1 if fits or config.reach > 1 else 8
+    return SheetLayout(rows, cols, workers, depth, fixed_rows, config)
 
 
 class SheetSolver(ABC, Generic[Kernel]):
@@ -26,13 +81,16 @@ class SheetSolver(ABC, Generic[Kernel]):
         cores: largest number of CPU cores; by default all available cores.
 
     Attributes:
-        sheet: the sheet in the memory of the device.
+        plan: current plan.
+        layout: memory layout, and configuration of the kernels.
         steps_done: number of steps taken.
+        inconsistent: whether an interruption left the arrays inconsistent; all methods but `restart` then raise
+            MsmError.
     """
 
     def __init__(self, plan: Plan, device: Device, layout: SheetLayout | None = None, cores: int | None = None) -> None:
-        self.sheet = PlannedSheet(plan, self._build_kernel, device, layout, cores)
-        self._begin(None)
+        self._device, self._given_layout, self._cores = device, layout, cores
+        self.restart(plan)
 
     @staticmethod
     @abstractmethod
@@ -44,19 +102,11 @@ class SheetSolver(ABC, Generic[Kernel]):
         self.steps_done = 0 if state is None else state.steps
 
     @property
-    def plan(self) -> Plan:
-        """The current plan."""
-        return self.sheet.plan
-
-    @property
-    def layout(self) -> SheetLayout:
-        """The memory layout, and the configuration of the kernels."""
-        return self.sheet.layout
-
-    @property
-    def inconsistent(self) -> bool:
-        """Whether an interruption left the arrays inconsistent; all methods but `restart` then raise MsmError."""
-        return self.sheet.inconsistent
+    def kernel(self) -> Kernel:
+        """The arrays of the sheet, with the kernels that move and read it; MsmError while a restart is incomplete."""
+        if self._kernel is None:
+            raise MsmError("interrupted while the sheet was restarted; restart the scene")
+        return self._kernel
 
     def restart(self, plan: Plan, state: State | None = None) -> None:
         """Restart with the same or another plan, without compilation if only coefficients differ.
@@ -65,8 +115,13 @@ class SheetSolver(ABC, Generic[Kernel]):
             plan: the plan.
             state: state to continue from, of a sheet with the same mass points and steps; by default the sheet at rest.
         """
+        self.inconsistent = True
         self._begin(state)
-        self.sheet.restart(plan, state)
+        self.plan, self.layout = plan, self._given_layout or choose_layout(plan, self._device, self._cores)
+        self._real = np.dtype(np.float32 if self.layout.config.precision == "f32" else np.float64)
+        self._kernel: Kernel | None = None  # Frees its memory before the new arrays are allocated.
+        self._kernel = self._build_kernel(plan, self.layout, _initial_data(plan, self.layout, state))
+        self.inconsistent = False
 
     def steer(self, plan: Plan) -> None:
         """Continue with other probes, with the same kernels and the same steps.
@@ -77,7 +132,17 @@ class SheetSolver(ABC, Generic[Kernel]):
         Raises:
             ArgumentError: when the new probes require other kernels.
         """
-        self.sheet.steer(plan)
+        config, terms = self.layout.config, build_terms(plan)
+        if [tool.probe for tool in plan.tools] != [tool.probe for tool in self.plan.tools]:
+            raise ArgumentError("probes: which of them have a path cannot change; restart with the new scene")
+        for term in terms:
+            compiled = config.get(type(term))
+            if compiled and (reason := term.supports(compiled)):
+                raise ArgumentError(f"probes: {reason}")
+        if decay_parameters(plan) != decay_parameters(self.plan):
+            probes = config.require(ProbeTerm)
+            self.kernel.arrays.set_fields(config.first_field(ProbeTerm), probes.fields(plan))
+        self.plan = plan
 
     @abstractmethod
     def advance(self, steps: int, pause: Pause = lambda: None) -> None:
@@ -110,4 +175,81 @@ class SheetSolver(ABC, Generic[Kernel]):
 
     def close(self) -> None:
         """Release the memory of the device."""
-        self.sheet.close()
+        self._kernel = None
+
+    def _load_table(self, loads: Schedule, first: int) -> NDArray[Any]:
+        """Compute the load table of consecutive steps, with a gain of 0.
+
+        Args:
+            loads: loads at the steps.
+            first: number of the first step.
+
+        Returns:
+            Load table in the precision of the kernels, shape (steps, columns).
+        """
+        config = self.layout.config
+        table = np.zeros((len(loads.active), config.first_column(None)))
+        for term in config.terms:
+            column = config.first_column(type(term))
+            table[:, column : column + term.column_count] = term.columns(self.plan, loads, first)
+        # Loads too large for f32 become infinite; the next reading of the sheet detects it.
+        with np.errstate(over="ignore"):
+            return table.astype(self._real)
+
+    def _measure(self, *, moving: bool) -> Reading:
+        """Read and measure the sheet.
+
+        Args:
+            moving: whether the energy includes the kinetic energy.
+        """
+        displacement, measures = self._read_arrays(differences=False)
+        config, plan = self.layout.config, self.plan
+        springs = measures[:, config.first_measure(SpringTerm) :]
+        # The measures are (L^2 - L0^2) / L0^2.
+        extremes = springs[:, MIN_STRAIN].min(), springs[:, MAX_STRAIN].max()
+        shortest, longest = (math.sqrt(max(0.0, 1.0 + float(extreme))) for extreme in extremes)
+        sums = measures.sum(axis=0, dtype=np.float64)
+        energy = plan.material.mass * float(sums[base.SQUARED_MOTION]) / plan.grid.step**2 if moving else 0.0
+        for term in config.terms:
+            first = config.first_measure(type(term))
+            energy += term.energy(sums[first : first + len(term.reductions)], plan)
+        return Reading(self.steps_done, displacement, shortest, longest, energy / 2)
+
+    def _read_arrays(self, *, differences: bool) -> tuple[NDArray[Any], NDArray[Any]]:
+        """Read displacements or last differences, see `SheetKernel.read`, and the measures of every row."""
+        rows, cols, count = self.layout.rows, self.layout.cols, self.layout.config.first_measure(None)
+        values, measures = np.empty((rows, cols, 3), self._real), np.empty((rows, count), self._real)
+        self.kernel.read(differences, values, measures)
+        return values, measures
+
+    def _read_memory(self) -> NDArray[Any]:
+        """Read the numbers that terms remember, shape (numbers, rows, cols)."""
+        fields = [self.kernel.arrays.get_fields(n, 1) for n in self.layout.config.memory_fields]
+        # Only some kernels step fixed mass points, whose memory has no effect.
+        fields = [np.where(self.plan.fixed, 0, field).astype(self._real) for field in fields]
+        return np.concatenate([np.empty((0, self.layout.rows, self.layout.cols), self._real), *fields])
+
+
+def _initial_data(plan: Plan, layout: SheetLayout, state: State | None) -> InitialData:
+    sheet = plan.scene.sheet
+    moves, column, areas = ~plan.fixed, np.arange(layout.cols), area_shares(sheet)
+    # One row of each kind: first, middle, last.
+    kinds = [0, layout.rows // 2, -1]
+    shares = areas[kinds] if layout.config.by_area else np.ones((3, layout.cols))
+    by_column = np.empty((base.COLUMN_ROWS, layout.cols))
+    by_column[base.MOBILITY : base.MOBILITY + 3] = moves[kinds] / shares
+    # Springs along columns read the shares of a middle row even in a sheet of two rows.
+    by_column[base.AREA_SHARE : base.AREA_SHARE + 3] = areas[0], 2 * areas[0], areas[-1]
+    by_column[base.REST_X] = axes(sheet)[0]
+    by_column[base.HAS_LEFT] = column > 0
+    by_column[base.HAS_RIGHT] = column < layout.cols - 1
+    constants = (
+        *spacing(sheet),
+        sheet.size[0] / 2,
+        *(n for term in layout.config.terms for n in term.constants(plan)),
+    )
+    fields = np.concatenate([term.fields(plan) for term in layout.config.terms])
+    if state is not None and len(state.memory):
+        fields[layout.config.memory_fields] = state.memory
+    stiffness = layout.config.require(SpringTerm).stiffness_array(plan)
+    return InitialData(np.array(constants), by_column, fields, stiffness, state)

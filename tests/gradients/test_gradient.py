@@ -26,7 +26,7 @@ from taichi_msm.gradients.motion import MotionAdjoint
 from taichi_msm.model.plan import Plan
 from taichi_msm.model.sheet import rest_positions
 from taichi_msm.solver import backoff
-from taichi_msm.solver.planned_sheet import choose_layout
+from taichi_msm.solver.sheet_solver import choose_layout
 from taichi_msm.system.runtime import Device
 from taichi_msm.terms.base import KernelConfig, Term
 from taichi_msm.terms.foundation import FoundationTerm

@@ -19,8 +19,8 @@ from taichi_msm.runs.finished import read_run
 from taichi_msm.runs.run import resume, run
 from taichi_msm.runs.simulation import Simulation
 from taichi_msm.scene.scene import Scene
-from taichi_msm.solver.planned_sheet import choose_layout
 from taichi_msm.solver.rest import FORCE_TOLERANCE, build_dynamics
+from taichi_msm.solver.sheet_solver import choose_layout
 from taichi_msm.study.study import run_study
 from taichi_msm.system.runtime import Device
 from tests.conftest import Program

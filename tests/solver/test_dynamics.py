@@ -19,7 +19,7 @@ from taichi_msm.scene.scene import Scene
 from taichi_msm.scene.section import MAX_POINTS
 from taichi_msm.solver import backoff, kernel_cpu, kernel_gpu
 from taichi_msm.solver.arrays import SheetLayout
-from taichi_msm.solver.planned_sheet import POINTS_PER_WORKER
+from taichi_msm.solver.sheet_solver import POINTS_PER_WORKER
 from taichi_msm.system import process
 from taichi_msm.system.launches import MAX_ROUNDS, VULKAN_THREADS
 from taichi_msm.system.process import available_threads
@@ -300,13 +300,13 @@ def test_interrupted_launch(device: Device, monkeypatch: pytest.MonkeyPatch, mes
     expected = dynamics.displacement()
     dynamics.restart(dynamics.plan)
     dynamics.advance(10)
-    saved, advance = dynamics.state(), dynamics.sheet.kernel.advance
+    saved, advance = dynamics.state(), dynamics.kernel.advance
 
     def interrupted(*arguments: Any) -> None:
         advance(*arguments)
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(dynamics.sheet.kernel, "advance", interrupted)
+    monkeypatch.setattr(dynamics.kernel, "advance", interrupted)
     with pytest.raises(KeyboardInterrupt):
         dynamics.advance(5)
     monkeypatch.undo()

@@ -12,8 +12,8 @@ from PIL import Image
 
 from taichi_msm.scene.scene import Scene
 from taichi_msm.solver.arrays import SheetLayout
-from taichi_msm.solver.planned_sheet import choose_layout
 from taichi_msm.solver.rest import build_dynamics
+from taichi_msm.solver.sheet_solver import choose_layout
 from taichi_msm.system.runtime import Device
 from tests.scenes import PRESS, plan_of, random_tissue, scene, speckle
 from tests.scenes import SHEET as SPRING_SHEET
