@@ -58,8 +58,9 @@ def focal_fault(focal: Sequence[float], size: Sequence[float]) -> str:
     """
     for name, extent, length, pixels in zip(("fx", "fy"), ("width", "height"), focal, size, strict=True):
         if length < pixels / 20:
-            fault = f"{name} = {length:g} is below 1/20 of the picture {extent}, {pixels:g} px, too short for any lens"
-            return f"{fault}; convert it to pixels (normalised: multiply by {pixels:g}; mm: divide by the pixel pitch)"
+            fault = f"{name} = {length:g} is below 1/20 of the picture {extent}, {pixels:g} px"
+            remedy = f"convert it to pixels (normalised: multiply by {pixels:g}; mm: divide by the pixel pitch)"
+            return f"{fault}, too short to be in pixels; {remedy}"
     return ""
 
 

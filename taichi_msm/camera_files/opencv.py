@@ -47,7 +47,7 @@ LENSES = {
     **dict.fromkeys(("pinhole", "perspective", "mono", "monocular"), ""),
     **dict.fromkeys(("plumbbob", "rationalpolynomial", "rational", "radtan", "radialtangential", "opencv"), "pinhole"),
     **dict.fromkeys(("equidistant", "equi", "fisheye", "opencvfisheye", "kannalabrandt", "kannalabrandt4"), "fisheye"),
-    **dict.fromkeys(("omnidir", "omnidirectional", "omni", "unified"), "omnidir"),
+    **dict.fromkeys(("omnidir", "omnidirectional", "omni", "mei", "unified"), "omnidir"),
     **dict.fromkeys(("none", "nodistortion", "undistorted"), NO_DISTORTION),
 }
 FLAGS = {
@@ -81,7 +81,11 @@ def read_camera(keys: Keys) -> Calibration:
         fault = f"{listed(names)}: unknown, and may change the projection"
         raise keys.fault(f"{fault}; found {keys}; {_REMEDY}, or remove the keys that do not matter", names[0])
     model, values = ("pinhole", []) if model == NO_DISTORTION else (model, values or [])
-    lens = _coefficients(keys, model, [*xi, *values] if model == "omnidir" else values)
+    if model == "omnidir":
+        if not xi:
+            raise keys.fault("an omnidirectional lens without xi; add xi", keys.find(COEFFICIENTS))
+        values = [*xi, *values]
+    lens = _coefficients(keys, model, values)
     return Calibration((fx, fy), (cx, cy), size, model, lens)
 
 

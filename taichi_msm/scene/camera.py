@@ -362,7 +362,7 @@ class Camera(Section):
             calibration = read_calibration(self.calibration, self.calibration_eye, unit)
         except CameraFileError as error:
             raise scene_fault(str(error), "calibration") from None
-        if calibration.focal and (fault := focal_fault(calibration.focal, calibration.size or size)):
+        if calibration.focal and not calibration.size and (fault := focal_fault(calibration.focal, size)):
             raise scene_fault(f"{self.calibration}: {fault}", "calibration")
         if self.scale and calibration.size is None:
             fault = "lacks the picture size, which scale needs; add image_width and image_height"
