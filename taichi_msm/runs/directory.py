@@ -165,7 +165,7 @@ class Publication:
         try:
             is_new = self._read_record(record)
             if not is_new(record.name):
-                raise ValueError("no record of itself")
+                raise ValueError
         except ValueError:
             raise DamagedError(f"{record} is damaged; remove {self.staging_folder} and run the scene again") from None
         is_resumed = entry_kind(moved_record) is not None

@@ -199,6 +199,12 @@ def test_foreign_files_are_kept(directory: Path, message: Messages) -> None:
     assert contents(directory) == {**expected(NEW, "new"), "frames/0100.png": "mine", "animation.gif": "mine"}
 
 
+def test_unwritable_folder_of_results(directory: Path, monkeypatch: pytest.MonkeyPatch, message: Messages) -> None:
+    monkeypatch.setattr(os, "access", lambda path, mode: Path(path).name != "frames")
+    with message.raises(PermissionError, "frames"), Publication(directory, RUN_PUBLICATION, NEW):
+        pass
+
+
 def test_abandoned_hidden_folders_are_deleted(tmp_path: Path) -> None:
     """Locked or incomplete folders, and those with foreign files, are kept."""
     names = (*(16 * letter for letter in "abcd"), "mine")
