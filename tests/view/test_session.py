@@ -230,7 +230,7 @@ def test_reset(begin: Begin) -> None:
     assert session.recorded_scene().time.duration == pytest.approx(5 / session.frame_rate)
 
 
-def test_change_of_material_keeps_positions_and_velocities(begin: Begin) -> None:
+def test_change_of_material_keeps_positions_and_velocities(begin: Begin, message: Messages) -> None:
     changed, same = begin(TILTED), begin(TILTED)
     for session in (changed, same):
         session.handle(Press(60, 50))
@@ -247,6 +247,8 @@ def test_change_of_material_keeps_positions_and_velocities(begin: Begin) -> None
     expected = begin({**TILTED, "springs.structural": 180.0})
     expected.handle(Press(60, 50))
     assert advance(changed, 150)[-1] == pytest.approx(advance(expected, 160)[-1], abs=1e-4)
+    changed.handle(Key("w"))
+    message(changed.notice, "reset (r)")
     changed.handle(Key("r"))
     assert (displacement(changed) < AT_REST).all()
     assert changed.material()["springs.structural"] == (180.0, 20.0)
@@ -310,7 +312,7 @@ def test_press_outside_the_sheet(begin: Begin, message: Messages) -> None:
     assert session.notice == ""
 
 
-def test_saved_files_have_free_names(begin: Begin) -> None:
+def test_saved_files_have_free_names(begin: Begin, message: Messages) -> None:
     Path("captures").mkdir()
     Path("captures/speckle.png").write_bytes(b"another picture")
     session = begin(TILTED)
@@ -330,6 +332,10 @@ def test_saved_files_have_free_names(begin: Begin) -> None:
     assert scene.time.duration == pytest.approx(10 / session.frame_rate)
     assert scene.image == "captures/speckle-2.png"
     assert Path("captures/speckle.png").read_bytes() == b"another picture"
+    message(Path("captures/session-2.yaml").read_text().partition("\n")[0])
+    Path("speckle.png").unlink()
+    with message.raises(FilesError, "speckle.png"):
+        session.handle(Key("w"))
 
 
 def test_film_has_the_duration_of_the_session(begin: Begin) -> None:
@@ -426,6 +432,8 @@ def test_divergence_is_reported_and_reset(begin: Begin, message: Messages) -> No
     frame = session.frame
     advance(session, 3)
     assert session.frame == frame
+    session.handle(Material("springs.structural", 30.0))
+    message(session.notice, "reset it (r)")
     session.handle(Key("w"))
     assert session.notice == "saved captures/session-1.yaml"
     again = run(load_scene("captures/session-1.yaml", {"output": []}), "again", threads=2)
