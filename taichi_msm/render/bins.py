@@ -1,4 +1,7 @@
-"""Spatial bins: squares of the picture, each with a list of the cells whose bounding box overlaps it."""
+"""Spatial bins: squares of the picture, each with a list of the cells whose bounding box overlaps it.
+
+For gpu.py, the cells are parts of cells.
+"""
 
 from typing import Any, NamedTuple
 
@@ -9,11 +12,11 @@ from taichi_msm.render.config import Integers
 from taichi_msm.system.launches import Launches, end_thread
 from taichi_msm.system.runtime import compilation_options, ti
 
-# Offsets in the bounding box of a cell: its first and last column and row, clipped to the picture. For an invisible
-# cell, the last column or row is before the first one.
+# Layout of `bounds`: for every cell the first and last column and row, clipped to the picture; if the cell is
+# invisible, the last column or row is before the first.
 FIRST_X, FIRST_Y, LAST_X, LAST_Y, BOUNDS_STRIDE = range(5)
 
-# Limit of coordinates, so that they fit into an integer.
+# Limit of coordinates, which are integers.
 MAX_BOUND = 1e6
 
 # Maximum number of entries of all lists, divided by the number of cells and bins together.
@@ -41,7 +44,7 @@ def build_bins(launches: Launches, bounds: Any, cells: int, extent: tuple[int, i
         bounds: bounding boxes as stored by `store_bounds`, on the device, shape (cells * BOUNDS_STRIDE,).
         cells: number of cells.
         extent: width and height of the picture, in the unit of the bounds.
-        size: width and height of a bin; doubled until the lists have at most `MAX_MEAN_ENTRIES` per cell and bin.
+        size: width and height of a bin; doubled while the lists have more than `MAX_MEAN_ENTRIES` per cell and bin.
 
     Returns:
         The lists of the cells that overlap each bin.
@@ -187,7 +190,7 @@ def _assign_entries(
     for entry in range(first, end):
         cell = owner_of(entry, cells, ends)
         left, right, top, bottom = _bin_range(cell, size, bounds)
-        # Number of the entry among those of the cell, which end at `ends[cell]`.
+        # Index of the entry among those of its cell.
         n = (right - left) * (bottom - top) + entry - ends[cell]
         bins[entry] = (top + n // (right - left)) * columns + left + n % (right - left)
         positions[entry] = ti.atomic_add(counts[bins[entry]], 1)
