@@ -16,7 +16,7 @@ from taichi_msm.system.runtime import compilation_options, ti
 # invisible, the last column or row is before the first.
 FIRST_X, FIRST_Y, LAST_X, LAST_Y, BOUNDS_STRIDE = range(5)
 
-# Limit of coordinates, which are integers.
+# Limit of the coordinates, which fit into integers.
 MAX_BOUND = 1e6
 
 # Maximum number of entries of all lists, divided by the number of cells and bins together.
@@ -49,33 +49,22 @@ def build_bins(launches: Launches, bounds: Any, cells: int, extent: tuple[int, i
     Returns:
         The lists of the cells that overlap each bin.
     """
-    if launches.bounded:
-        return _build_in_parallel(launches, bounds, cells, extent, size)
-    while True:
-        columns, rows = (-(-side // size) for side in extent)
-        ends = np.zeros(columns * rows + 1, np.int32)
-        with compilation_options(optimised=False):
-            _count_cells(cells, size, columns, bounds, ends)
-        starts = np.cumsum(ends, dtype=np.int64)
-        if starts[-1] <= MAX_MEAN_ENTRIES * (cells + columns * rows):
-            break
-        size *= 2
-    entries = np.empty(max(1, starts[-1]), np.int32)
-    with compilation_options(optimised=False):
-        _list_cells(cells, size, columns, bounds, starts[:-1].astype(np.int32), entries)
-    return Bins(size, columns, ends[1:].reshape(rows, columns), starts.astype(np.int32), entries)
-
-
-def _build_in_parallel(launches: Launches, bounds: Any, cells: int, extent: tuple[int, int], size: int) -> Bins:
     corners = launches.download(bounds).reshape(cells, 2, 2)
     while True:
         columns, rows = (-(-side // size) for side in extent)
         bins_per_cell = np.maximum(corners[:, 1] // size - corners[:, 0] // size + 1, 0).prod(axis=1, dtype=np.int64)
         ends = np.cumsum(bins_per_cell)
-        if ends[-1] <= MAX_MEAN_ENTRIES * (cells + columns * rows):
+        total = int(ends[-1])
+        if total <= MAX_MEAN_ENTRIES * (cells + columns * rows):
             break
         size *= 2
-    total = int(ends[-1])
+    if not launches.bounded:
+        lengths, entries = np.zeros(columns * rows, np.int32), np.empty(max(1, total), np.int32)
+        with compilation_options(optimised=False):
+            _count_cells(cells, size, columns, bounds, lengths)
+            starts = np.concatenate([[0], np.cumsum(lengths)]).astype(np.int32)
+            _list_cells(cells, size, columns, bounds, starts[:-1].copy(), entries)
+        return Bins(size, columns, lengths.reshape(rows, columns), starts, entries)
     counts, cell_ends = launches.upload(np.zeros(columns * rows, np.int32)), launches.upload(ends.astype(np.int32))
     bins, positions, entries = (launches.array(np.int32, max(1, total)) for _ in range(3))
     launches.launch(
@@ -140,19 +129,19 @@ def _bin_range(cell, size, bounds: ti.template()):
 
 
 @ti.kernel
-def _count_cells(cells: ti.i32, size: ti.i32, columns: ti.i32, bounds: Integers, ends: Integers):
-    """Count the cells of every bin; the count of bin n is in `ends[n + 1]`."""
+def _count_cells(cells: ti.i32, size: ti.i32, columns: ti.i32, bounds: Integers, counts: Integers):
+    """Count the cells of every bin."""
     ti.loop_config(serialize=True)
     for cell in range(cells):
         left, right, top, bottom = _bin_range(cell, size, bounds)
         for row in range(top, bottom):
             for column in range(left, right):
-                ends[row * columns + column + 1] += 1
+                counts[row * columns + column] += 1
 
 
 @ti.kernel
 def _list_cells(cells: ti.i32, size: ti.i32, columns: ti.i32, bounds: Integers, ends: Integers, entries: Integers):
-    """List the cells of every bin; `ends` holds the start of each list before, and its end after."""
+    """List the cells of every bin; `ends`, at first the start of each list, is updated to its end."""
     ti.loop_config(serialize=True)
     for cell in range(cells):
         left, right, top, bottom = _bin_range(cell, size, bounds)

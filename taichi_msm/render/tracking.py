@@ -139,15 +139,10 @@ def _instrument_depth(scene: Scene, pixels: Array, view: View, instruments: Sequ
 def _track(
     scene: Scene, points: Array, position: Array, view: View, instruments: Sequence[Solid], *, as_flow: bool
 ) -> tuple[NDArray[np.float32], NDArray[np.uint8]]:
-    """Return the pixels of points, shape (n, 2), or their flow, and their occlusion, shape (n,).
+    """Return the pixels of points, or with `as_flow` their flow, and their occlusion.
 
-    Args:
-        scene: scene with the sheet and the size of the picture.
-        points: coordinates of material points, shape (n, 2), or points of instruments [m], shape (n, 3).
-        position: positions of the mass points [m], shape (rows, cols, 3).
-        view: camera of the picture.
-        instruments: bodies of the tools, which occlude points.
-        as_flow: whether to return the flow from another frame, of which `points` has all pixels, row by row.
+    The points are coordinates of material points, shape (n, 2), or points of instruments [m], shape (n, 3). For the
+    flow from another frame, they are those at the centres of its pixels, row by row.
     """
     total, is_material = len(points), points.shape[-1] == 2
     if total == 0:
@@ -248,7 +243,7 @@ def _mark_simple_bins(
         around_point = length <= CELLS_AROUND_POINT and last_i - first_i <= 1 and last_j - first_j <= 1
         if around_point:
             facing_sum, count = 0.0, 0.0
-            # Also of cells that do not overlap the bin.
+            # Also with cells that do not overlap the bin.
             for i in range(first_i, last_i + 1):
                 for j in range(first_j, last_j + 1):
                     facing_sum += outlines[(i * (cols - 1) + j) * CELL_STRIDE + CELL_FACING]
@@ -398,7 +393,7 @@ def _kernel(lens: str, shapes: tuple[str, ...], is_material: bool) -> Callable[.
             chunk_size: number of cells of the chunk.
             points: coordinates of material points, shape (2 * n,); or X, Y, w and depth of points of instruments,
                 shape (4 * n,).
-            as_flow: 0 for pixels; 1 for displacements of point k from the centre of pixel k of another frame.
+            as_flow: 0 for pixels; 1 for displacements of points k from the centres of pixels k of another frame.
             uniforms: constants of the undistorted view, and the lens.
             sizes: sizes and counters, as returned by `sizes_of`.
             nodes: projected mass points, NODE_STRIDE numbers each.
