@@ -503,7 +503,7 @@ def _oblique(scene: Scene) -> Camera:
     """Return the preset oblique: the sheet at rest fits into the picture, with a margin of 4 % in distance."""
     (height, width), (width_px, height_px) = scene.sheet.size, scene.render.size
     toward = OBLIQUE_DIRECTION / np.linalg.norm(OBLIQUE_DIRECTION)
-    axes = extrinsics(Camera(eye=tuple(toward), fov=OBLIQUE_FOV), 0.0).axes
+    axes = _look_at_axes(toward.tolist(), (0, 0, 0), (0, 1, 0))
     corners = np.array([[x, y, 0.0] for x in (-width / 2, width / 2) for y in (-height / 2, height / 2)]) @ axes.T
     half_height = np.tan(np.radians(OBLIQUE_FOV) / 2)
     half = np.array([half_height * width_px / height_px, half_height])
