@@ -30,9 +30,10 @@ COEFFICIENTS = (
 # image_width, image_height; image_size, resolution
 WIDTH, HEIGHT = f"{_PICTURE}?(width|w)", f"{_PICTURE}?(height|h)"
 SIZE = f"{_PICTURE}?(size|resolution|res|dims?)"
-# distortion_model, lens; those that may also be the type of a device; is_fisheye
+# distortion_model, lens_type; of these, keys whose value may also be the type of a device
 LENS = r"(camera|cam|lens|distortion|dist|projection|calibration|calib)?(model|type)(name|type)?|lens|projection"
 LENS_OR_DEVICE = r"lens|type|projection"
+# is_fisheye
 FISHEYE = r"(is|use)?fisheye(model)?"
 # R, rotation_matrix; T, tvec
 ROTATION = r"r|rot|rotation|rmat|(rot|rotation)(mat|matrix)"

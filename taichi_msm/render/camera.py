@@ -54,7 +54,7 @@ class View(NamedTuple):
     distance: float  # from the eye to the target, at the start [m]
     pinhole: bool  # whether the projection is perspective
     lens: Lens | None = None
-    baseline: float = 0.0  # distance to the companion along the x axis [m]; 0 unless they are parallel
+    baseline: float = 0.0  # distance to the companion along the x axis [m]; 0 unless the cameras are parallel
     companion: View | None = None  # second camera of the stereo pair, whose key `beside` names this camera
     light_view: View | None = None  # camera that carries the light; None if it is this camera
 
@@ -453,7 +453,7 @@ def _top(scene: Scene) -> View:
 
 def _pinhole(camera: Camera, scene: Scene, time: float) -> View:
     placement = extrinsics(camera, time)
-    # A camera that moves keeps the distance at the start, and so the intensity of its light.
+    # The distance is that at the start, so the light of a moving camera keeps its intensity.
     return _pinhole_at(camera, scene, placement._replace(distance=extrinsics(camera, 0.0).distance))
 
 

@@ -59,7 +59,7 @@ class Cell(NamedTuple):
 
 @ti.func
 def _max_edge(p_x, p_y, q_x, q_y, box: ti.template(), facing):
-    """Return the maximum of `geometry.edge` in a box: left, right, top, bottom [samples]; not below any sample's."""
+    """Return the largest `geometry.edge` in a box: left, right, top and bottom [samples]."""
     left, right, top, bottom = ti.static(box)
     x = ti.select((q_y - p_y) * facing > 0.0, left, right)
     y = ti.select((q_x - p_x) * facing > 0.0, bottom, top)
@@ -222,7 +222,7 @@ def intersect_instrument(x, y, index, uniforms: ti.template(), shapes: ti.templa
     """
     base = uni.INSTRUMENTS + index * uni.INSTRUMENT_STRIDE
     tip, axis = base + uni.TIP, base + uni.AXIS
-    # Relative to the tip, the line of sight is O + D t, and t the depth.
+    # Relative to the tip, the line of sight is O + D t, with t the depth.
     start = uniforms[tip + 2] * (-1.0)
     across, up = geometry.line_of_sight(x, y, uniforms)
     w = geometry.w_at(start, uniforms)
@@ -230,6 +230,7 @@ def intersect_instrument(x, y, index, uniforms: ti.template(), shapes: ti.templa
     d_x, d_y = across * uniforms[uni.PINHOLE], up * uniforms[uni.PINHOLE]
     a_x, a_y, a_z = triple(uniforms, axis)
     length, radius = uniforms[base + uni.LENGTH], uniforms[base + uni.RADIUS]
+    # Scalar products of O, D and the axis A.
     d_d, d_a = d_x * d_x + d_y * d_y + 1.0, d_x * a_x + d_y * a_y - a_z
     o_a, o_d, o_o = o_x * a_x + o_y * a_y, o_x * d_x + o_y * d_y, o_x * o_x + o_y * o_y
     intersect_first = ti.static(_compile_ray(shapes[0]))
@@ -406,7 +407,7 @@ def _footprint(entry, x, y, s, t, texels_x, texels_y, triangle: ti.template(), b
 
 @ti.func
 def _distance_to_line(coordinate, right_coordinate, lower_coordinate):
-    """Return the distance of samples from the nearest line of the mesh in one direction [samples].
+    """Return the distance of samples from the nearest mesh line of one direction [samples].
 
     Args:
         coordinate: coordinate of the samples across the lines [cells].

@@ -260,6 +260,7 @@ def find_quads(x, y, inside, subdivisions, patch: ti.template()):
         subdivisions: sub-quads along a side of the cell.
         patch: bilinear surface of the cell.
     """
+    # The two equations are a_1 + b_1 s + c_1 t + d_1 s t = 0, and the same with 2.
     coefficients = ti.static((patch.a, patch.b, patch.c, patch.d))
     a_1, b_1, c_1, d_1 = [k[0] - x * k[2] for k in coefficients]
     a_2, b_2, c_2, d_2 = [k[1] - y * k[2] for k in coefficients]
@@ -322,6 +323,7 @@ def on_triangle(x, y, triangle: ti.template()):
         y: undistorted rows [samples].
         triangle: drawn triangle of a sub-quad.
     """
+    # The two equations are p_1 + r_1 s + d_1 t = 0, and the same with 2.
     coefficients = ti.static((triangle.p, triangle.r, triangle.d))
     p_1, r_1, d_1 = [k[0] - x * k[2] for k in coefficients]
     p_2, r_2, d_2 = [k[1] - y * k[2] for k in coefficients]

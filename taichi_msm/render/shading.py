@@ -11,7 +11,7 @@ M = 2 (N L) N - L the direction of ideal reflection of the light:
     colour   = texture light + 255 gloss (M V)^shininess d0 / d
 
 d is the distance of P from the light, d0 that of the main camera's target, and diffuse0 the diffuse light at the
-target on a sheet that faces the camera, whose colours are those of the texture. Wrapped diffuse light approximates
+target on a sheet that faces the camera. There the colours are those of the texture. Wrapped diffuse light approximates
 scattering in tissue: no side of a dent is black. An instrument shades the tissue near it: at r radii from its axis, it
 removes the share uniforms.SHADE / r^2 of the light.
 
@@ -63,7 +63,7 @@ def _shade(entry, left, top, texels: ti.template(), band: ti.template()):
 
 @ti.func
 def _write_colours(colour: ti.template(), row, end_row, tile, colours: ti.template(), band: ti.template()):
-    """Write the colours of the tile in column `tile` of tiles, without supersampling."""
+    """Write the colours of a tile without supersampling; `tile` is its index in the row."""
     packed = ti.floor(colour[0] + 0.5) + ti.floor(colour[1] + 0.5) * 256.0 + ti.floor(colour[2] + 0.5) * 65536.0
     width = ti.static(band.config.tile_width)
     for tile_line in ti.static(range(band.config.tile_height)):
@@ -216,6 +216,7 @@ def _apply_relief(normal: ti.template(), slope_x, slope_y, uniforms: ti.template
     a, b = triple(uniforms, uni.ACROSS), triple(uniforms, uni.UP)
     n = [normal[k] * length for k in ti.static(range(3))]
     relief_x, relief_y = slope_x * uniforms[uni.SLOPE_X], slope_y * uniforms[uni.SLOPE_Y]
+    # Subtract from n the tangential part of the gradient, relief_x a + relief_y b.
     projection = relief_x * dot(a, n) + relief_y * dot(b, n)
     for k in ti.static(range(3)):
         normal[k] = n[k] * (projection + 1.0) - relief_x * a[k] - relief_y * b[k]
@@ -386,6 +387,7 @@ def _filter_texture(entry, is_covered, texels: ti.template(), band: ti.template(
     colour, slope_x, slope_y = _fetch(first, width, height, x, y, texels, config)
     if ti.static(config.tissue):  # noqa: SIM102  (evaluated at compile time)
         if max_footprint > 1.0:
+            # The same position in the next coarser level.
             x = x * 0.5 - 0.25
             y = y * 0.5 - 0.25
             coarse_colour, coarse_slope_x, coarse_slope_y = _fetch(

@@ -48,7 +48,7 @@ def _visible_region(lens: Lens, scale: Pair, centre: Pair, size: Pair) -> Visibl
     if np.isnan(radius):
         radius = lens.limit
         border = np.array([[-radius, -radius], [radius, radius]])
-    # The margin of one pixel is the distance of the border points.
+    # The margin of one pixel is the spacing of the border points.
     (left, top), (right, bottom) = border.min(axis=0) * scale + centre - 1, border.max(axis=0) * scale + centre + 1
     # The derivatives are bounded by their maximum on a polar grid, with a safety factor.
     radii, angles = np.meshgrid(radius * np.linspace(0, 1, 256), np.linspace(0, 2 * np.pi, 64))
