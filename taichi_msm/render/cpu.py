@@ -193,7 +193,7 @@ def _kernel(config: DrawingConfig) -> Callable[..., None]:
                 (rows * cols * POINT_STRIDE + 2 * rows,).
             samples: undistortion map, then the G-buffer of a band for each worker, written.
             colours: red, green and blue of all pixels, row by row, as words or bytes, written.
-            labels: all pixels of one label after the other, as described by `labels.label_channels`, written.
+            labels: all pixels of one label after the other, written.
         """
         for index in range(workers * ITERATIONS_PER_THREAD):
             if index % ITERATIONS_PER_THREAD == 0:

@@ -71,19 +71,24 @@ def values_per_pixel(names: Collection[str]) -> int:
     return sum(len(LABELS[name].planes) for name in names)
 
 
-def label_channels(plane: Any, names: Collection[str]) -> list[tuple[int, int, int, int, Label]]:
-    """List the planes of the G-buffer with values of labels; a label without planes is 0.
+class Channel(NamedTuple):
+    """Plane of the G-buffer with a value of a label."""
+
+    plane: int  # index of the plane
+    label: Label
+    offset: int  # of the label [values per pixel]
+    number: int  # of the value in the label
+
+
+def label_channels(plane: Any, names: Collection[str]) -> list[Channel]:
+    """Return the channels of labels; a label without planes has none, and is 0.
 
     Args:
         plane: index of each plane of the G-buffer, by name.
         names: names of the labels.
-
-    Returns:
-        For each plane: its index; the offset of its label [values per pixel]; its index in the label; the number of
-        planes of the label; the label.
     """
     return [
-        (getattr(plane, plane_name), offset, n, len(label.planes), label)
+        Channel(getattr(plane, plane_name), label, offset, n)
         for _, label, offset in _label_offsets(names)
         for n, plane_name in enumerate(label.planes)
         if hasattr(plane, plane_name)

@@ -99,11 +99,11 @@ def _is_visible(camera: View, pixels: NDArray[np.float64], size: tuple[float, fl
         inverse = np.linalg.inv(camera.matrix[:3][:, [0, 1, 3]])
     except np.linalg.LinAlgError:
         return False
-    x, y, per_w = np.moveaxis(pixels @ inverse[:, :2].T + inverse[:, 2], -1, 0)
+    x, y, inverse_w = np.moveaxis(pixels @ inverse[:, :2].T + inverse[:, 2], -1, 0)
     height, width = size
     # Pixels without a line of sight are NaN, and compare false.
-    is_inside = (per_w > 0) & (np.abs(x) <= width / 2 * per_w) & (np.abs(y) <= height / 2 * per_w)
-    return bool((is_inside & (per_w * camera.near < 1)).any())
+    is_inside = (inverse_w > 0) & (np.abs(x) <= width / 2 * inverse_w) & (np.abs(y) <= height / 2 * inverse_w)
+    return bool((is_inside & (inverse_w * camera.near < 1)).any())
 
 
 def _stretched_picture(scene: Scene) -> Iterator[str]:

@@ -108,16 +108,20 @@ def _write_labels(entry, left, row, end_row, labels: ti.template(), band: ti.tem
     if ti.static(len(config.shapes) > 0):
         is_sheet = is_sheet & (samples[entry + plane.instrument] <= 0.0)
     values = [
-        ti.select(is_sheet if ti.static(label.sheet_only) else is_covered, samples[entry + vector], label.missing_value)
-        for vector, _offset, _number, _count, label in ti.static(channels)
+        ti.select(
+            is_sheet if ti.static(channel.label.sheet_only) else is_covered,
+            samples[entry + channel.plane],
+            channel.label.missing_value,
+        )
+        for channel in ti.static(channels)
     ]
     for line in ti.static(range(config.tile_height)):
         for n in ti.static(range(config.tile_width)):
             if row + line < end_row and left + n < band.width:
                 pixel = (row + line) * band.width + left + n
                 for channel, value in ti.static(zip(channels, values, strict=True)):
-                    _, first, number, count = ti.static(channel[:4])
-                    index = first * band.width * band.height + count * pixel + number
+                    count = ti.static(len(channel.label.planes))
+                    index = channel.offset * band.width * band.height + count * pixel + channel.number
                     labels[index] = value[line * config.tile_width + n]
 
 

@@ -28,9 +28,9 @@ from taichi_msm.scene.section import (
     scene_fault,
 )
 
-_COEFFICIENT_EXPECTS = "a number, {:g} to {:g}"
-Coefficient = Annotated[Number, Field(ge=-MAX_COEFFICIENT, le=MAX_COEFFICIENT)]
-_ANY_COEFFICIENT = _COEFFICIENT_EXPECTS.format(-MAX_COEFFICIENT, MAX_COEFFICIENT)
+_RANGE_EXPECTS = "a number, {:g} to {:g}"
+Coordinate = Annotated[Number, Field(ge=-MAX_COEFFICIENT, le=MAX_COEFFICIENT)]
+_COORDINATE_EXPECTS = _RANGE_EXPECTS.format(-MAX_COEFFICIENT, MAX_COEFFICIENT)
 
 _FOCAL_EXPECTS = "a number above 0, in pixels"
 _FOCAL_MEANING = "focal length [px]; required unless the lens model has one (scaramuzza)"
@@ -41,8 +41,8 @@ class Intrinsics(Section):
 
     fx: Positive | None = key(None, f"horizontal {_FOCAL_MEANING}", _FOCAL_EXPECTS)
     fy: Positive | None = key(None, f"vertical {_FOCAL_MEANING}", _FOCAL_EXPECTS)
-    cx: Coefficient = key(..., "x of the principal point [px]; 0 is the centre of the first pixel", _ANY_COEFFICIENT)
-    cy: Coefficient = key(..., "y of the principal point [px]; 0 is the centre of the first pixel", _ANY_COEFFICIENT)
+    cx: Coordinate = key(..., "x of the principal point [px]; 0 is the centre of the first pixel", _COORDINATE_EXPECTS)
+    cy: Coordinate = key(..., "y of the principal point [px]; 0 is the centre of the first pixel", _COORDINATE_EXPECTS)
 
 
 def _alternatives(names: Iterable[str]) -> str:
@@ -65,7 +65,7 @@ def _coefficient_keys() -> dict[str, Any]:
     return {
         name: (
             Annotated[Number, Field(ge=row.least, le=row.most)] | None,
-            key(row.default, row.meaning, _COEFFICIENT_EXPECTS.format(row.least, row.most)),
+            key(row.default, row.meaning, _RANGE_EXPECTS.format(row.least, row.most)),
         )
         for name, row in sorted(coefficients.items())
     }
@@ -96,7 +96,7 @@ class Distortion(_Coefficients):  # type: ignore[misc]
         coefficients = MODELS[self.model].coefficients
         for name, row in coefficients.items():
             if getattr(self, name) is None:
-                raise scene_fault(f"missing; expected {_COEFFICIENT_EXPECTS.format(row.least, row.most)}", name)
+                raise scene_fault(f"missing; expected {_RANGE_EXPECTS.format(row.least, row.most)}", name)
         for name in sorted(self.model_fields_set - {"model", *coefficients}):
             if getattr(self, name):
                 models = _alternatives(model for model, row in MODELS.items() if name in row.coefficients)
@@ -220,7 +220,7 @@ class Camera(Section):
         "direction that is up in the picture, or its keyframes",
         "three numbers: [x, y, z]," + _OR_KEYFRAMES,
     )
-    # f32 resolves directions to 2^-24 rad, 3.4e-6 degrees: at the minimum, about 300 rows of pixels are distinct.
+    # f32 resolves directions to 2^-24 rad, 3.4e-6 degrees: about 300 rows of pixels at the minimum.
     fov: Annotated[Number, Field(ge=0.001, lt=180)] = key(
         40.0,
         "vertical field of view, without distortion [degrees]",
@@ -257,7 +257,7 @@ class Camera(Section):
 
     @field_validator("eye", "target", "up", mode="after")
     @classmethod
-    def _check_order(cls, keyframes: Any, info: ValidationInfo) -> Any:
+    def _check_keyframes(cls, keyframes: Any, info: ValidationInfo) -> Any:
         if info.field_name == "eye" and keyframes is None and not {"beside", "pose", "poses"} & _given_before(info):
             raise scene_fault("missing; expected " + cls.model_fields["eye"].json_schema_extra["expects"])  # type: ignore
         if keyframes is not None and isinstance(keyframes[0], tuple):
