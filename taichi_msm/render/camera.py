@@ -21,8 +21,8 @@ from taichi_msm.scene.section import FRAME_TOLERANCE, MAX_SUPERSAMPLE, MIN_MAGNI
 
 Array = NDArray[np.float64]
 
-# Presets oblique and fit: direction to the eye, 50 degrees above the sheet and from its lower edge; field of view
-# [degrees].
+# Presets oblique and fit: direction from the target to the eye, over the lower edge of the sheet and 50 degrees above
+# it; field of view [degrees].
 OBLIQUE_DIRECTION = np.array([0.0, -0.64, 0.77])
 OBLIQUE_FOV = 32.0
 
@@ -564,7 +564,7 @@ def _nearest_rotation(matrix: Array) -> Array:
 
 
 def _interpolate_keyframes(value: Sequence[float] | Sequence[Sequence[float]], time: float) -> Sequence[float]:
-    """Return a constant vector, or interpolate keyframes (time [s], x, y, z) linearly, and constantly beyond them."""
+    """Return a constant vector as it is; interpolate keyframes (time [s], x, y, z) linearly, constant beyond them."""
     keys = np.array(value)
     if keys.ndim == 1:
         return value  # type: ignore[return-value]

@@ -83,7 +83,7 @@ def _invisible_sheet(scene: Scene) -> Iterator[str]:
     rate = scene.time.frames_per_second
     for name in scene.render.all_cameras:
         camera = view_at(scene, 0.0, name)
-        # A sheet that falls between 100 x 100 test pixels is only a dot, as with a camera in millimetres.
+        # A sheet between the 100 x 100 test pixels is only a dot, as with a camera in millimetres.
         centres = (np.arange(100) + 0.5) / 100
         pixels = camera.undistort(np.stack(np.meshgrid(*(centres * side for side in camera.size)), axis=-1))
         frames = range(scene.time.frames + 1 if is_moving(scene, name) else 1)

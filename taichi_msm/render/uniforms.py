@@ -23,7 +23,7 @@ WIRE_COLOUR = (235, 245, 255)
 WIRE_WIDTH = 1.0
 WIRE_OPACITY = 0.75
 
-# Largest size of a sample on the texture that is filtered at full resolution [texels]; the bilinear filter spans two.
+# Largest size on the texture of a sample that needs no mipmap [texels]; the bilinear filter spans two.
 FULL_RESOLUTION_TEXELS = 2.0
 
 # Offset of the light from the eye, to the right and up, as a fraction of the distance to the target.
