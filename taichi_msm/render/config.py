@@ -5,34 +5,22 @@ for the 16 lanes of AVX-512, 4 x 2 for 8 lanes, 4 x 1 for 4 lanes, and a single 
 G-buffer (depth, normals, ...) has one vector per tile. On a CPU the unit of parallel work is a band, some rows of
 tiles, and each worker has the G-buffer of one band.
 
-Names that the functions of kernel 2 share. Arguments of kernels:
+Names that the functions of kernel 2 share, in addition to the fields of `DrawingConfig` and `Band`:
 
-    config                compile-time configuration
-    uniforms, sizes       constants of the view; sizes and counters (uniforms.py)
     position              positions of the mass points [m], shape (rows, cols, 3)
-    nodes                 projected mass points (geometry.py)
-    samples               G-buffer; with lens distortion also the undistortion map
     texels                levels of the texture, as returned by `pyramid`
     colours, labels       colours of all pixels, as words or bytes; labels of all pixels, one label after the other
-    lens                  name of the lens model; empty without lens distortion
     first, end, ended     first index of a launch; index after the last one; counter of finished threads (`end_thread`)
 
-Mass points, cells and triangles:
-
-    rows, cols            number of rows and columns of mass points
     i, j                  row and column of a mass point or a cell
     corner                first entry of a cell's upper left mass point in `nodes`
     distorted_entry       first entry of its distorted position in `nodes`
-    near, depth           near plane [m]; depth [m]
-    facing                1 if the front of a cell is visible, -1 for its back
     quad_column, quad_row column and row of sub-quads in their cell
     quad_side             side of the sub-quads, as a fraction of the cell's
     lower                 whether a triangle is below the diagonal of its sub-quad; for cells that are not invertible
     enlargement           enlargement of such a triangle, as a fraction of its side
     s, t                  coordinates on a triangle, to the right and down
     across, along         coordinates in a cell, to the right and down, from 0 to 1
-
-Tiles and pixels:
 
     entry                 first entry of a tile in the G-buffer
     left, top             first column and row of a tile [samples]

@@ -409,10 +409,8 @@ def _footprint(entry, x, y, s, t, texels_x, texels_y, triangle: ti.template(), b
 def _distance_to_line(coordinate, right_coordinate, lower_coordinate):
     """Return the distance of samples from the nearest mesh line of one direction [samples].
 
-    Args:
-        coordinate: coordinate of the samples across the lines [cells].
-        right_coordinate: that of the next samples on the right.
-        lower_coordinate: that of the next samples below.
+    `coordinate` is that of the samples across the lines [cells]; the others are those of the next samples on the right
+    and below.
     """
     step_right, step_down = right_coordinate - coordinate, lower_coordinate - coordinate
     slope = ti.sqrt(step_right * step_right + step_down * step_down)

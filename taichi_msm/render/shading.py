@@ -316,19 +316,9 @@ def _bilinear(upper_left, upper_right, lower_left, lower_right, u, v):
 
 @ti.func
 def _fetch(first, width, height, x, y, texels: ti.template(), config: ti.template()):
-    """Interpolate a level of the texture bilinearly.
+    """Interpolate a level, `width` x `height` texels from `first` on, bilinearly at column x and row y.
 
-    Args:
-        first: first texel of the level.
-        width: width of the level [texels].
-        height: height of the level [texels].
-        x: column in the level [texels].
-        y: row in the level [texels].
-        texels: texels of all levels.
-        config: compile-time configuration.
-
-    Returns:
-        Colour; with a relief, the gradient of the grey level to the right and down [1/texel].
+    Return the colour; with a relief, also the gradient of the grey level, to the right and down [1/texel].
     """
     # The texture is constant beyond the centres of its outermost texels.
     texel_x = ti.max(ti.min(x, width - 1.0), 0.0)
