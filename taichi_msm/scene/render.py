@@ -160,7 +160,7 @@ class Render(Section):
         """Follow the `baseline` of a camera to the camera that it copies.
 
         Returns:
-            The copied camera, or the camera itself without `baseline`; its distance along the x axis [m].
+            The copied camera, or the camera itself without `baseline`; and the distance from it along its x axis [m].
         """
         camera, distance = self.all_cameras[name], 0.0
         while isinstance(camera, Camera) and camera.beside is not None and camera.baseline is not None:

@@ -74,7 +74,7 @@ class _Fault(NamedTuple):
     path: Key  # to the key at fault
     error: ErrorDetails
     kind: str  # pydantic's type of the error
-    section: type[BaseModel]  # section of the key, or, for a key that is a section, that section
+    section: type[BaseModel]  # innermost section in the path
     field: FieldInfo | None  # of the last key in the path
     branches: tuple[tuple[Key, str], ...]  # keys with a union type, each with the member that failed
 
@@ -126,9 +126,9 @@ def _section_types(annotation: Any) -> Iterator[type[BaseModel]]:
 
 
 def _choose_members(faults: Sequence[_Fault]) -> Iterator[_Fault]:
-    """For a value of a union type, keep the faults of the member that the value most probably is.
+    """Keep the faults of one member of each union type, the member with the deepest fault.
 
-    That member has the deepest fault. If two are equally deep, the value as a whole is the fault.
+    The value most probably has the type of that member. If two faults are equally deep, the whole value is at fault.
     """
     depths: dict[Key, dict[str, int]] = defaultdict(dict)
     for fault in faults:
@@ -258,7 +258,7 @@ class Section(BaseModel, metaclass=_SectionMeta):
     """Base class of the sections of a scene, which are immutable.
 
     Raises:
-        SceneError: when a key is unknown, missing or invalid in the constructor or in `model_copy`; at any assignment.
+        SceneError: by the constructor and `model_copy`, when a key is unknown, missing or invalid; by any assignment.
     """
 
     model_config = ConfigDict(frozen=True, extra="forbid", validate_default=True)
