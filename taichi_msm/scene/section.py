@@ -57,7 +57,7 @@ def key_problems(error: ValidationError, section: type[BaseModel], data: Any) ->
     Args:
         error: errors of the validation.
         section: model of the data.
-        data: validated data, of plain Python types.
+        data: the validated values, of plain Python types.
 
     Returns:
         Problems in the order of the errors, without duplicates at lists and unions.
@@ -132,15 +132,15 @@ def _choose_members(faults: Sequence[_Fault]) -> Iterator[_Fault]:
     """
     depths: dict[Key, dict[str, int]] = defaultdict(dict)
     for fault in faults:
-        for key, kind in fault.branches:
-            depths[key][kind] = max(depths[key].get(kind, 0), len(fault.path))
+        for path, member in fault.branches:
+            depths[path][member] = max(depths[path].get(member, 0), len(fault.path))
     for fault in faults:
-        for key, kind in fault.branches:
-            deepest = max(depths[key].values())
-            if list(depths[key].values()).count(deepest) > 1:
-                yield fault._replace(path=key, kind="choice")
+        for path, member in fault.branches:
+            deepest = max(depths[path].values())
+            if list(depths[path].values()).count(deepest) > 1:
+                yield fault._replace(path=path, kind="choice")
                 break
-            if depths[key][kind] != deepest:
+            if depths[path][member] != deepest:
                 break
         else:
             yield fault

@@ -263,7 +263,7 @@ def _thread_ids() -> list[int]:
 
 
 def _pin(pool: list[int]) -> None:
-    """Pin each thread of Taichi's pool to a core, if it has one per core; threads that share a core spin for 10 ms."""
+    """Pin Taichi's threads to the cores if their numbers are equal; threads that share a core would spin for 10 ms."""
     if hasattr(os, "sched_setaffinity") and len(pool) == len(os.sched_getaffinity(0)):
         for thread, core in zip(pool, sorted(os.sched_getaffinity(0)), strict=True):
             with contextlib.suppress(OSError):

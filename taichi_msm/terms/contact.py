@@ -87,7 +87,7 @@ class ContactTerm(Term):
         return (*names, "holder", *(f"held {axis}" for axis in "xyz")) if self.grips else names
 
     def has_history(self, plan: Plan) -> bool:
-        """Return whether mass points stick to a tool."""
+        """Return whether any tool is rough."""
         return any(tool.rough for tool in plan.tools)
 
     def fields(self, plan: Plan) -> NDArray[Any]:

@@ -158,7 +158,7 @@ class ProbeTerm(Term):
 
 
 def decay_parameters(plan: Plan) -> list[tuple[object, ...]]:
-    """Return the parameters of the decay factors of the stationary slots, to detect changes."""
+    """Return control point and force law, without the force, of the stationary slots, to detect other decay factors."""
     probes = [plan.scene.probes[slot.probe] for slot in plan.slots if not slot.moves]
     return [(probe.at, probe_force(probe, plan.scene.sheet)[1:]) for probe in probes]
 

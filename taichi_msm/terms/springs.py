@@ -13,8 +13,8 @@ diagonals:
 The lattice then approximates an isotropic sheet in plane stress. Springs imply Poisson's ratio 1/3; docs/model.md
 contains the derivation.
 
-Under a pretension S a spring of rest length L0 has the tension tau L0 at rest. Here tau = e k1, with its stiffness k1
-for f = 1 and e = S / (3/2 E t).
+Under a pretension S a spring of rest length L0 has the tension tau L0 at rest, where tau = k1 e, k1 is its stiffness
+for f = 1, and e = S / (3/2 E t).
 """
 
 # No `from __future__ import annotations` here: Taichi reads the annotations of a kernel.
@@ -57,7 +57,7 @@ class SpringTerm(Term):
 
     structural: bool  # whether the sheet has springs along rows and columns
     shear: bool  # whether the sheet has springs along diagonals
-    open_edges: bool  # whether any mass point at an edge can move; if so, springs beyond the edge have no force
+    open_edges: bool  # whether any mass point at an edge can move; only then are springs beyond the edge masked
     by_area: bool  # whether springs along an open edge are softer, because they belong to one cell
     mapped: bool  # whether each stiffness is read from an array, with 0 for springs beyond an edge
     tense: bool  # whether the sheet is under tension at rest
@@ -154,7 +154,7 @@ class SpringTerm(Term):
         squares = np.array([dx**2, dy**2, dx**2 + dy**2])
         return float((sums[STRETCH_SUMS:TENSION_SUMS] + plan.material.tensions * sums[TENSION_SUMS:]) @ squares)
 
-    def build_parameters(self, config: KernelConfig) -> Callable[..., Any]:
+    def _build_parameters(self, config: KernelConfig) -> Callable[..., Any]:
         """Build the Taichi function parameters_of(sheet, family), the list of the parameters of the law."""
         ti, count, first = config.ti, self.law.parameter_count, config.first_constant(SpringTerm) + FIRST_PARAMETER
 
@@ -200,7 +200,7 @@ class SpringTerm(Term):
         """
         ti, vector, tense = config.ti, config.vector, self.tense
         open_edges, tense_edges = self.open_edges, self.tense_edges
-        first_tension, parameters_of = config.first_constant(SpringTerm) + FIRST_TENSION, self.build_parameters(config)
+        first_tension, parameters_of = config.first_constant(SpringTerm) + FIRST_TENSION, self._build_parameters(config)
         pull = config.compile_law(self.law, tense=tense).pull
 
         @ti.func
@@ -311,7 +311,7 @@ class SpringTerm(Term):
         """
         ti, tense, count = config.ti, self.tense, self.law.parameter_count
         _, derivatives, parameter_derivatives, _ = config.compile_law(self.law, tense=tense)
-        first_tension, parameters_of = config.first_constant(SpringTerm) + FIRST_TENSION, self.build_parameters(config)
+        first_tension, parameters_of = config.first_constant(SpringTerm) + FIRST_TENSION, self._build_parameters(config)
 
         @ti.func
         def differentiate(
@@ -386,7 +386,7 @@ class SpringTerm(Term):
         row_stiffness, column_stiffness, diagonal_stiffness = self.build_stiffness(config)
         row_share, column_share = self.build_cell_shares(config)
         tense_edges = self.tense_edges
-        first_tension, parameters_of = config.first_constant(SpringTerm) + FIRST_TENSION, self.build_parameters(config)
+        first_tension, parameters_of = config.first_constant(SpringTerm) + FIRST_TENSION, self._build_parameters(config)
         energy = config.compile_law(self.law, tense=self.tense).energy
         # For each family its index, and the rows down and columns right from one end of a spring to the other.
         structural = ((ALONG_ROW, 0, (1,)), (ALONG_COLUMN, 1, (0,))) if self.structural else ()
