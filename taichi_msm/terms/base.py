@@ -176,7 +176,7 @@ class Correction(NamedTuple):
 
 
 class RestCorrection(NamedTuple):
-    """Taichi functions that correct a `RestSheet`.
+    """Taichi functions that correct a sheet in quasi-static equilibrium.
 
     Attributes:
         remove: remove(force, sheet, at) subtracts the part that the term carries from the force on entry `at`.

@@ -1,16 +1,18 @@
 """Contact, friction and grips of position-controlled tools. Scene: `probes` with `path`.
 
 In dynamic scenes, contact corrects the displacements u of the mass points after each step, one tool after the other in
-the order of `probes`. Let c be the tip of the tool, and depth and n the depth and outward normal in its shape
-(`taichi_msm.shapes`) of X + u - c; u' and c' are u and c before the step. Mass points with depth > 0, neither fixed nor
-held, are projected out of the shape, and the friction mu reduces their slip:
+the order of `probes`. In the shape of a tool with the tip c, X + u - c has a depth and an outward normal n
+(`taichi_msm.shapes`). Mass points with depth > 0, neither fixed nor held, are projected out of the shape, and the
+friction mu reduces their slip; u' and c' are those before the step:
 
     slip = (u + depth n - u') - (c - c'),    w = slip - (slip . n) n
     correction = depth n - w min(1, mu depth / |w|)
 
 A correction has the effect of the force correction / gain (`model.verlet`), so the corrections yield the force of the
-tool. A grip holds the mass points within 1.5 radii of the tip's centre at its start: u = u_start + c - c_start. A
-clamp, a tool of radius 0 whose c is a displacement, holds its side from the start of the run: u = c.
+tool.
+
+A grip holds the mass points within 1.5 radii of the tip's centre at its start: u = u_start + c - c_start. A clamp, a
+tool of radius 0 whose c is a displacement, holds its side from the start of the run: u = c.
 
 In quasi-static scenes a tool pushes the mass points that touch it, and never pulls. Of the force F on a mass point it
 carries the part into its shape, min(F . n, 0) n; the remainder, tangential or outward, vanishes in equilibrium. If

@@ -107,20 +107,14 @@ class SpringTerm(Term):
 
     @staticmethod
     def stiffness_bound(material: Material, sheet: Sheet) -> float:
-        """Return an upper bound of m w^2 [N/m], valid while springs exceed half their rest length.
-
-        The energy is a sum over cells. A spring of a cell has at most the energy k / 2 |q|^2. With a quarter of the
-        mass of a mass point at each corner, every mode of a cell, and hence every mode of the sheet, satisfies
-
-            m w^2 <= 4 max(across + down, across + 2 shear, down + 2 shear)
-
-        With a map, the mass of each mass point is distributed over its cells in proportion to their stiffness. The
-        bound is then multiplied by the largest mean of the factors around a mass point.
-
-        Args:
-            material: coefficients of the sheet.
-            sheet: section `sheet` of the scene.
-        """
+        # While springs exceed half their rest length, a spring has at most the energy k / 2 |q|^2. The energy is a sum
+        # over cells. With a quarter of the mass of a mass point at each corner, every mode of a cell, and hence every
+        # mode of the sheet, satisfies
+        #
+        #     m w^2 <= 4 max(across + down, across + 2 shear, down + 2 shear)
+        #
+        # With a map, the mass of each mass point is distributed over its cells in proportion to their stiffness. The
+        # bound is then multiplied by the largest mean of the factors around a mass point.
         largest = 1.0
         if material.factors is not None:
             largest = largest_mean(material.factors) if material.by_area else float(material.factors.max())
