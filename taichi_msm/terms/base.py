@@ -126,7 +126,7 @@ class Term(ABC):
     def build_tangents(self, config: KernelConfig) -> Sequence[Callable[..., Any]]:
         """Build Taichi functions add(force, sheet, entry, now), which add the linearised change of the force.
 
-        Here `entry.u` and `sheet.u` are changes of displacements, and `entry.shape` is the displacement.
+        Here `entry.u` and `sheet.u` are changes of displacements, and `entry.displacement` is the displacement.
         """
         return ()
 
@@ -337,4 +337,4 @@ class Entry(NamedTuple):
     row: KernelRow
     b: Any  # index of the entry in its row
     u: Any  # displacement, a list of x, y and z; for tangents its change
-    shape: Any = None  # for tangents, the displacement
+    displacement: Any = None  # for tangents only

@@ -104,10 +104,10 @@ class FoundationTerm(Term):
 
         @ti.func
         def add(force: ti.template(), sheet: ti.template(), entry: ti.template(), now: ti.template()):
-            k, shape = stiffness_at(sheet, entry, now[column]), ti.static(entry.shape if tangent else entry.u)
+            k, u = stiffness_at(sheet, entry, now[column]), ti.static(entry.displacement if tangent else entry.u)
             for c in ti.static(range(3)):
                 if ti.static(locks and c == 2):
-                    force[c] = force[c] - k * (entry.u[c] * ratio(sheet, shape[2]))
+                    force[c] = force[c] - k * (entry.u[c] * ratio(sheet, u[2]))
                 else:
                     force[c] = force[c] - k * entry.u[c]
 
