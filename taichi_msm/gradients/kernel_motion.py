@@ -250,7 +250,7 @@ def _build_sweep_row(code: KernelConfig) -> Callable[..., None]:
     vector, columns, springs = code.vector, code.first_column(None), code.require(SpringTerm)
     structural, shear, tension = springs.structural, springs.shear, springs.tense
     differentiate = springs.build_spring_tangent(code)
-    *_, row_stiffness, column_stiffness, diagonal_stiffness = springs.build_spring_forces(code)
+    row_stiffness, column_stiffness, diagonal_stiffness = springs.build_stiffness(code)
     tangents = [add for term in code.terms for add in term.build_tangents(code)]
     dampings = [damp for term in code.terms for damp in term.build_damping(code)]
     probes, foundation_term = code.require(ProbeTerm), code.get(FoundationTerm)
@@ -259,7 +259,7 @@ def _build_sweep_row(code: KernelConfig) -> Callable[..., None]:
     slots, standing = len(probes.moves), probes.moves.count(False)
     foundation = code.first_column(FoundationTerm) if foundation_term else 0
     foundation_derivatives = [foundation_term.build_derivatives(code)] if foundation_term else []
-    shares = [foundation_term.build_share(code)] if foundation_term and foundation_term.locks else []
+    stiffness_functions = [foundation_term.build_stiffness(code)] if foundation_term and foundation_term.locks else []
     locks = springs.law.parameter_count > 0
     results = 7 if locks else 5
 
@@ -350,8 +350,8 @@ def _build_sweep_row(code: KernelConfig) -> Callable[..., None]:
                     for derive in ti.static(foundation_derivatives):
                         index, by_foundation = (FOUNDATION_PART * sheet.rows + i) * width + b, derive(sheet, p, u)
                         add(sheet.derivatives, index, by_foundation[0] * (0 - now[foundation]))
-                        for share in ti.static(shares):
-                            k = share(sheet, entry, now[foundation])
+                        for stiffness_at in ti.static(stiffness_functions):
+                            k = stiffness_at(sheet, entry, now[foundation])
                             for n in ti.static(range(2)):
                                 at_sum = ti.static(FOUNDATION_LOCK_SUMS + n)
                                 sums[at_sum] = sums[at_sum] - k * by_foundation[1 + n]

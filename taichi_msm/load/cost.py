@@ -230,7 +230,7 @@ class DurationEstimate(NamedTuple):
     """Estimated duration of a run [s]."""
 
     seconds: float
-    start: float  # share before the first step [s], included in `seconds`
+    start: float  # time before the first step [s], included in `seconds`
 
 
 def estimate_duration(plan: Plan) -> DurationEstimate:
