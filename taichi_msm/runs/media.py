@@ -23,7 +23,7 @@ from PIL import Image
 
 Picture = NDArray[np.uint8]  # colours, shape (height, width, 3), or palette indices, shape (height, width)
 
-# Limits of a frame's delay [1/100 s]: browsers replace 0 and 1 by 10, and the field has 16 bits.
+# Limits of a frame's duration [1/100 s]: browsers replace 0 and 1 by 10, and the field has 16 bits.
 MIN_GIF_DELAY = 2
 MAX_GIF_DELAY = 0xFFFF
 
@@ -34,8 +34,8 @@ TRANSPARENT_INDEX = PALETTE_SIZE
 
 def predict_colours(picture: Picture) -> Picture:
     """Predict typical colours of an animation, shape (n, m, 3), from its first frame, shape (height, width, 3)."""
-    # A grid of at most 48 pixels per axis, at several brightnesses: the first frame shows the sheet at rest; later,
-    # parts of the sheet turn toward the headlight or away.
+    # Pixels of a coarse grid, at most 48 per axis, at several brightnesses: later, parts of the sheet turn toward the
+    # headlight or away.
     stride = -(-max(picture.shape) // 48)
     samples = picture[::stride, ::stride].astype(np.float32)
     brightnesses = (1.0, 1.0, 1.0, 1.0, 1.15, 1.3, 0.8, 0.6, 0.35, 0.15)
@@ -163,7 +163,7 @@ class GifWriter:
         self._file.write(b"\x08" + Image.fromarray(patch).tobytes("gif", "L", 8, 0) + b"\x00")
 
 
-# Colour space and range of HDTV, stated in the file; otherwise players choose them by the size of the picture.
+# Colour space and range of HDTV. Without them in the file, players choose others by the size of the picture.
 BT709, LIMITED_RANGE = 1, 1
 
 # Largest denominator of a frame rate or of its inverse; the time base of MP4 has 32 bits.
