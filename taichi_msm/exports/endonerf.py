@@ -6,9 +6,9 @@
     poses_bounds.npy    a row per frame, float64: the matrix [right, up, backward, eye, (height, width, focal length)],
                         shape (3, 5), row by row, from the camera to the world; least and largest depth of the frame
 
-The loaders read integers, and depths, eyes and bounds in one unit: 0.01 mm, or the next power of ten in which the
-depths fit 16 bits. The world axes are those of the first camera, from which EndoNeRF renders its videos, and from which
-rays start in normalised device coordinates. The loaders assume one focal length and a centred principal point.
+Depths are integers. Their unit, also that of eyes and bounds, is 0.01 mm, or the smallest larger power of ten in which
+the depths fit 16 bits. The world axes are those of the first camera, where EndoNeRF renders its videos and begins its
+rays in normalised device coordinates. The loaders assume one focal length and a centred principal point.
 
 Source: med-air/EndoNeRF, load_llff.py (`_load_data`, `load_llff_data`) and run_endonerf_helpers.py (`get_rays`) at
 5201b1e; yifliu3/EndoGaussian, scene/endo_loader.py (`load_meta`, `format_infos`, `get_pts_cam`) at d7aad82.
@@ -31,7 +31,7 @@ from taichi_msm.scene.outputs import zero_padded
 
 FORMAT_NAME = "endonerf"
 
-# Smallest unit of length [m], and the largest value of a pixel.
+# Smallest unit of length [m], and largest value of a pixel of a depth.
 MIN_UNIT_M, MAX_VALUE = 1e-5, 65535
 
 # Picture size that EndoGaussian's loader assumes [px].

@@ -25,7 +25,7 @@ from taichi_msm.runs.finished import FinishedRun, damaged_result, reading
 from taichi_msm.scene.outputs import CAMERA_FILE
 from taichi_msm.system.files import read_regular
 
-# Exported vertices are the mass points: the surface between them is bilinear, so a refinement adds no information.
+# Vertices are the mass points. The surface between them is bilinear: a refinement would add no information.
 EXPORT_REFINE = 0
 
 # Enough digits for any float32.
@@ -119,7 +119,7 @@ def read_depth(run: FinishedRun, frame: int) -> NDArray[np.float32]:
     """
     path = run.result_path("depth", frame)
     with reading(path), Image.open(path, formats=["TIFF"]) as image:
-        # Checked before pixels are decoded, which could take any memory.
+        # Checked before decoding, which could take any amount of memory.
         if image.mode != "F" or image.size != run.scene.render.size:
             raise damaged_result(path)
         depth = np.array(image)
@@ -144,7 +144,7 @@ def read_picture_file(run: FinishedRun, key: str, frame: int) -> bytes:
 
 Array = NDArray[np.float64]
 
-# Pixel coordinate of the first pixel's centre; it is 0 in OpenCV [px].
+# Coordinate of the first pixel's centre [px]; it is 0 in OpenCV.
 FIRST_PIXEL_CENTRE = 0.5
 
 

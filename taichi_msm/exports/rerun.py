@@ -50,7 +50,7 @@ except ImportError:
 
 def _write_run(run: FinishedRun, path: Path, progress: ProgressCallback) -> list[str]:
     """Write a recording of a run."""
-    # The viewer merges recordings with the same identity.
+    # The viewer merges recordings with the same identity: here, those of the same folder.
     identity = uuid5(NAMESPACE_URL, run.directory.resolve().as_uri())
     with rerun.RecordingStream("taichi_msm", recording_id=identity) as recording:
         recording.save(path)
@@ -91,7 +91,7 @@ def _log_run(run: FinishedRun, recording: Any, progress: ProgressCallback) -> No
         (read_track_positions(camera_run)[1] for camera_run in camera_runs.values() if camera_run.has_output("tracks")),
         None,
     )
-    # Distinct colours; the hues of successive points are 0.618 turns apart.
+    # Distinct colours: the hues of successive tracks are 0.618 turns apart.
     phase = np.arange(0 if tracks is None else len(tracks))[:, None] * 0.618 + np.array([0, 1 / 3, 2 / 3])
     colours = (127.5 + 127.5 * np.cos(2 * np.pi * phase)).astype(np.uint8)
     instruments = [number for number, probe in enumerate(run.scene.probes) if probe.instrument is not None]

@@ -1,8 +1,8 @@
 """Adjoint of the time stepping, with checkpoints.
 
-The forward run stores a checkpoint at the beginning of every segment; N steps have about sqrt(N / 2) segments, or fewer
-if the sheet is small. Then, backward in time, each segment runs again and stores the displacements of all its steps,
-and the adjoint is swept over them (`kernel_motion`).
+The forward run stores a checkpoint at the beginning of every segment. N steps have about sqrt(N / 2) segments, a small
+sheet fewer. Then, from the last segment to the first, each one runs again and stores the displacements of all its
+steps, and the adjoint is swept over them (`kernel_motion`).
 """
 
 from __future__ import annotations
@@ -37,18 +37,18 @@ from taichi_msm.terms.loads import ProbeTerm
 # Memory of a segment's displacements up to which segments are lengthened, to save launches [bytes].
 SEGMENT_BYTES = 64 * 2**20
 
-# Number of times that a worker checks its neighbour before it gives up; larger than in the forward run, because a
-# single worker then finishes the launch, and its kernel may have to be compiled first.
+# Number of times that a worker checks its neighbour before it gives up. It is larger than in the forward run, because
+# giving up is more expensive: the kernel of the single worker that finishes the launch may not be compiled yet.
 MAX_WAIT_CHECKS = 8 * MAX_CHECKS
 
 Array = NDArray[np.float64]
 
 
 def _segment_steps(steps: int, step_bytes: int) -> int:
-    """Return the number of steps of a segment.
+    """Return the number of steps of a segment, for the displacements of a step of `step_bytes`.
 
-    The memory of its displacements at least equals that of all checkpoints. A checkpoint has twice the size of the
-    displacements of a step, `step_bytes`.
+    The memory of a segment and of all checkpoints, 2 `step_bytes` each, has the smallest sum where both are equal. A
+    longer segment saves launches.
     """
     return min(steps, max(math.ceil(math.sqrt(2 * steps)), SEGMENT_BYTES // step_bytes))
 
@@ -92,7 +92,7 @@ class MotionAdjoint:
 
     @property
     def _decay_parts(self) -> int:
-        """Number of parts of `_derivatives` that hold `decay_gradients`, two per slot that does not move."""
+        """Number of parts of `_derivatives` with `ProbeTerm.decay_gradients`, two per slot that does not move."""
         return 2 * self.layout.config.require(ProbeTerm).moves.count(False)
 
     def _allocate(self) -> None:
@@ -113,7 +113,7 @@ class MotionAdjoint:
 
         checkpoint_rows = -(-plan.grid.steps // self._segment) * layout.rows
         self._memory = memory
-        # Displacements u and differences d at the beginning of every segment, each a list of arrays for x, y and z.
+        # Displacements u and differences d at the beginning of every segment, three arrays each for x, y and z.
         self._checkpoints, self._checkpoint_differences = vector(checkpoint_rows), vector(checkpoint_rows)
         # Displacements at every step of a segment, and differences at its current step.
         self._history = vector(self._segment * layout.rows + self._worker_rows)
@@ -246,7 +246,7 @@ class MotionAdjoint:
         return max(first, frame, end - self._max_launch_steps())
 
     def _sweep(self, first: int, end: int, by_frame: Array, table: Array) -> Array:
-        """Sweep backward from step `end` of the segment that begins at `first`, over the steps of a table of loads.
+        """Sweep backward from step `end` over the steps of a table of loads, within the segment that begins at `first`.
 
         Returns:
             Derivatives with respect to the loads, shape (steps, slots, 5).

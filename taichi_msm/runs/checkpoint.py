@@ -342,7 +342,8 @@ class Checkpoint:
         raise _damaged(self._frames_path)
 
     def _checksum(self, frame: int, *parts: NDArray[Any]) -> int:
-        """Compute the CRC-32 of the manifest, the index and the parts of a frame; it differs in another run or frame."""
+        """Compute the CRC-32 of the manifest, the index and the parts of a frame."""
+        # The manifest and the index detect frames of another run or at another index.
         checksum = zlib.crc32(frame.to_bytes(8, "little"), zlib.crc32(self._manifest))
         for part in parts:
             checksum = zlib.crc32(part.data, checksum)

@@ -60,7 +60,8 @@ class PublicationSpec(NamedTuple):
     patterns: Collection[str]  # of all files that may be published, including the record
     read_record: Callable[[Mapping[str, Any]], IsListed]  # converts a record to a predicate of file names
     exclusive: bool = False  # whether other files in the directory are errors
-    unpublished: tuple[str, Collection[str]] | None = None  # a further folder next to the new files, with its patterns
+    # Folder next to the new files that is kept but not published, and patterns of its files.
+    unpublished: tuple[str, Collection[str]] | None = None
 
 
 class Publication:
@@ -79,7 +80,7 @@ class Publication:
     Attributes:
         staging_folder: folder for unpublished files.
         new_folder: folder for the new files under their final names.
-        keep_unpublished: whether the unpublished folder is kept at exit.
+        keep_unpublished: whether the unpublished folder of the spec is kept at exit.
     """
 
     def __init__(self, directory: Path, spec: PublicationSpec, names: Collection[str] = ()) -> None:

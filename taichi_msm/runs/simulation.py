@@ -257,10 +257,8 @@ class Simulation:
         state, per_frame = saved.state, self._plan.grid.steps_per_frame
         steps_in_frame = state.steps - saved.progress.frame * per_frame
         current = self._dynamics.displacement()
-        has_same_mesh = (state.displacement.shape, state.displacement.dtype) == (current.shape, current.dtype)
-        if not (
-            has_same_mesh and len(saved.felt.forces) == len(self.scene.probes) and 0 <= steps_in_frame <= per_frame
-        ):
+        same_mesh = (state.displacement.shape, state.displacement.dtype) == (current.shape, current.dtype)
+        if not (same_mesh and len(saved.felt.forces) == len(self.scene.probes) and 0 <= steps_in_frame <= per_frame):
             raise ArgumentError(
                 f"saved at step {state.steps}, frame {saved.progress.frame}, {state.displacement.dtype} of shape "
                 f"{state.displacement.shape}; take a state saved with this scene's points, probes, precision and step"
@@ -372,7 +370,8 @@ class Simulation:
             time: as for `draw`.
 
         Returns:
-            Displacement to the right and down [px], shape (height, width, 2), and occlusion, shape (height, width).
+            Displacement of each pixel to the right and down [px], shape (height, width, 2), and its occlusion, shape
+            (height, width).
         """
         return self.renderer.flow(before, self._shot(camera, positions, time))
 
@@ -516,7 +515,7 @@ class Simulation:
         return Snapshot(self._dynamics.state(), self.progress, self._probe_forces, self.scene.probes)
 
     def _require_open(self) -> None:
-        """Raise an MsmError after `close`, as kernels would write to freed memory, or in another thread."""
+        """Raise an MsmError in another thread, or after `close`, when kernels would write to freed memory."""
         if self._closed:
             raise MsmError("this simulation is closed; build a new one")
         runtime.require_start_thread()
