@@ -280,7 +280,7 @@ class Checkpoint:
             Path of the archive, which has the fields of `State` and `RunProgress` by name.
         """
         start = time.perf_counter()
-        self._write_state(_state_arrays(saved))
+        self._write_state(_to_arrays(saved))
         now = time.perf_counter()
         # Saving takes at most 2 % of the run's time.
         self._next_save = now + (now - start) / 0.02
@@ -288,12 +288,7 @@ class Checkpoint:
 
     def load(self) -> Snapshot | None:
         """Read the last saved state; None if there is none."""
-        # Names, dtypes and shapes of the arrays are those of the initial state.
-        scene, grid, zero = self._plan.scene, self._plan.grid, (0.0, 0.0, 0.0)
-        position = np.empty((*scene.sheet.points, 3), self.precision)
-        memory = np.empty((len(memory_names(self._plan)), *scene.sheet.points), self.precision)
-        felt = ProbeForces((TipForce(0, zero, zero),) * len(scene.probes), (PeakForce(0, zero),) * len(scene.probes))
-        expected = _state_arrays(Snapshot(State(0, position, position, memory), RunProgress(), felt))
+        expected = _to_arrays(self._empty_snapshot())
         try:
             with self._state_path.open("rb") as file, zipfile.ZipFile(file) as archive:
                 self._manifest = _manifest_bytes(archive)
@@ -304,22 +299,28 @@ class Checkpoint:
             return None
         except Exception:  # a forged archive may raise any type
             raise _damaged(self._state_path) from None
-        progress = RunProgress(**{field.name: arrays[field.name].item() for field in fields(RunProgress)})
-        state = State(int(arrays["steps"]), arrays["displacement"], arrays["difference"], arrays["memory"])
-        greatest = tuple(PeakForce(time, (x, y, z)) for time, x, y, z in arrays["greatest"].tolist())
+        saved, grid = _from_arrays(arrays), self._plan.grid
         if not (
-            progress.frame <= grid.frames
-            and 0 <= state.steps - progress.frame * grid.steps_per_frame <= grid.steps_per_frame
+            saved.progress.frame <= grid.frames
+            and 0 <= saved.state.steps - saved.progress.frame * grid.steps_per_frame <= grid.steps_per_frame
             and all(np.isfinite(array).all() for array in arrays.values())
-            and all(value >= 0 for value in asdict(progress).values())
+            and all(value >= 0 for value in asdict(saved.progress).values())
         ):
             raise _damaged(self._state_path)
-        return Snapshot(state, progress, ProbeForces(_tip_forces(arrays["forces"]), greatest))
+        return saved
 
     def close(self) -> None:
         """Close the file."""
         if self._file:
             self._file.close()
+
+    def _empty_snapshot(self) -> Snapshot:
+        """Return a snapshot with the dtypes and shapes of all arrays."""
+        scene, zero = self._plan.scene, (0.0, 0.0, 0.0)
+        position = np.empty((*scene.sheet.points, 3), self.precision)
+        memory = np.empty((len(memory_names(self._plan)), *scene.sheet.points), self.precision)
+        felt = ProbeForces((TipForce(0, zero, zero),) * len(scene.probes), (PeakForce(0, zero),) * len(scene.probes))
+        return Snapshot(State(0, position, position, memory), RunProgress(), felt)
 
     def _write_state(self, arrays: Mapping[str, NDArray[Any]]) -> None:
         """Replace the state file by the manifest and the arrays of a state."""
@@ -350,12 +351,19 @@ class Checkpoint:
         return checksum
 
 
-def _state_arrays(saved: Snapshot) -> dict[str, NDArray[Any]]:
-    """Convert a state and its progress to arrays by name."""
+def _to_arrays(saved: Snapshot) -> dict[str, NDArray[Any]]:
+    """Convert a snapshot to arrays, by the names of their fields; tool paths are part of the plan."""
     greatest = np.array([(peak.time, *peak.force) for peak in saved.felt.greatest]).reshape(-1, PEAK_FORCE_COLUMNS)
     forces = {"forces": _tip_force_array(saved.felt.forces), "greatest": greatest}
     named = {**saved.state._asdict(), **asdict(saved.progress), **forces}
     return {name: np.asarray(value) for name, value in named.items()}
+
+
+def _from_arrays(arrays: Mapping[str, NDArray[Any]]) -> Snapshot:
+    progress = RunProgress(**{field.name: arrays[field.name].item() for field in fields(RunProgress)})
+    state = State(int(arrays["steps"]), arrays["displacement"], arrays["difference"], arrays["memory"])
+    greatest = tuple(PeakForce(time, (x, y, z)) for time, x, y, z in arrays["greatest"].tolist())
+    return Snapshot(state, progress, ProbeForces(_tip_forces(arrays["forces"]), greatest))
 
 
 def _tip_force_array(forces: Sequence[TipForce]) -> NDArray[np.float64]:

@@ -23,6 +23,7 @@ from taichi_msm.errors import (
     DeviceError,
     DivergedError,
     FilesError,
+    Pause,
     SceneError,
     StageProgressCallback,
     require_path,
@@ -194,7 +195,7 @@ def resume(
 
 
 def _find_unfinished(context: _RunContext) -> Manifest | None:
-    """Return the manifest with the versions of the unfinished run; None unless it has the same bits and estimate."""
+    """Return the manifest with the versions of the unfinished run; None unless that has the same bits and estimate."""
     try:
         unfinished, _ = read_manifest(context.directory)
     except (FilesError, SceneError):
@@ -270,7 +271,7 @@ class _Run:
         self._error_estimator: RunErrorEstimator | None = None
         self._path_dependence = PathDependence(plan) if plan.scene.time.at_rest else None
         requested = manifest.asks_estimate
-        self._repeats_solution = self._path_dependence is not None and (
+        self._seeks_second_solutions = self._path_dependence is not None and (
             requested is True
             or (requested is None and device.arch == "cpu" and self._path_dependence.affords(companions.cost))
         )
@@ -317,25 +318,35 @@ class _Run:
                     for camera, previous in observed.items():
                         observed[camera] = simulation.observe(previous.labels, camera, position, time)
                 writer.add(position, observed, simulation.forces())
-            if self._path_dependence:
-                self._path_dependence.check_frame(frame, position - rest)
-            if self._error_estimator and frame > 0:
-                with stage("pilot"):
-                    tool_forces = [simulation.forces()[tool.probe].force for tool in self._context.plan.tools]
-                    forces = np.array(tool_forces).reshape(-1, 3) if frame >= self._resumed_frames else None
-                    self._error_estimator.compare_frame(position - rest, report, forces)
-        # All frames are finished and have an error estimate: an interruption only skips further companion runs
-        # and second solutions.
+            self._compare_frame(frame, position - rest, report)
+        # All frames are finished and have an error estimate. An interruption only skips its refinement.
         with suppress(KeyboardInterrupt):
-            if self._error_estimator:
-                displacements = (writer.read_positions(frame) - rest for frame in range(1, self._frames))
-                with stage("pilot"):
-                    report = partial(self._progress, "pilot")
-                    self._error_estimator.finish(displacements if scene.output else None, report)
-            if self._path_dependence and self._repeats_solution:
-                with stage("pilot"):
-                    pause = partial(self._progress, "pilot", 0, 1)
-                    self._path_dependence.finish(self._context.device, self._cores, pause)
+            self._refine_estimate()
+
+    def _compare_frame(self, frame: int, displacement: NDArray[Any], pause: Pause) -> None:
+        """Compare the displacements of a frame with those of the companion runs, and check them for a jump."""
+        if self._path_dependence:
+            self._path_dependence.check_frame(frame, displacement)
+        if self._error_estimator and frame > 0:
+            with self._stopwatch.stage("pilot"):
+                forces = None  # unknown before the resumption
+                if frame >= self._resumed_frames:
+                    probes = self._simulation.forces()
+                    forces = np.array([probes[tool.probe].force for tool in self._context.plan.tools]).reshape(-1, 3)
+                self._error_estimator.compare_frame(displacement, pause, forces)
+
+    def _refine_estimate(self) -> None:
+        """Run the subsequent companion runs, and look for second solutions of a quasi-static scene."""
+        scene, stage = self._context.plan.scene, self._stopwatch.stage
+        if self._error_estimator:
+            rest = rest_positions(scene.sheet)
+            displacements = (self._writer.read_positions(frame) - rest for frame in range(1, self._frames))
+            with stage("pilot"):
+                self._error_estimator.finish(displacements if scene.output else None, partial(self._progress, "pilot"))
+        if self._path_dependence and self._seeks_second_solutions:
+            with stage("pilot"):
+                pause = partial(self._progress, "pilot", 0, 1)
+                self._path_dependence.finish(self._context.device, self._cores, pause)
 
     def save_finished_frames(self) -> dict[str, Any]:
         """Save the state and the finished frames of an interrupted run; reraise if there is no new frame."""
@@ -401,7 +412,6 @@ class _Run:
             )
             for record, peak in zip(probe_records(scene), self._simulation.felt.greatest, strict=True)
         ]
-
         notes = [
             *run_warnings(plan, probes, progress, estimates, _takes_an_hour_at_most, _pixels_per_metre(scene)),
             *(self._path_dependence.warnings() if self._path_dependence else ()),
@@ -500,12 +510,12 @@ def _error_record(estimates: RunErrorEstimates) -> dict[str, Any] | None:
     estimate, mesh, keys = estimates.time_step, estimates.mesh, ("error", "rounding", "in_f64", "order", "at_least")
     if estimate is not None:
         fields: dict[str, Any] = {key: getattr(estimate, key) for key in keys}
+        if not estimate.separate:
+            fields |= {"rounding": None, "in_f64": None}
     elif mesh is not None and estimates.reason == QUASISTATIC_REASON:
         fields = dict.fromkeys(keys) | {"at_least": False}
     else:
         return None
-    if estimate is not None and not estimate.separate:
-        fields |= {"rounding": None, "in_f64": None}
     if mesh is not None:
         fields |= {"mesh_error": mesh.error, "mesh_doubt": mesh.doubt}
     if estimates.force is not None:
