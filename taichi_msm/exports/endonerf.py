@@ -6,8 +6,8 @@
     poses_bounds.npy    a row per frame, float64: the matrix [right, up, backward, eye, (height, width, focal length)],
                         shape (3, 5), row by row, from the camera to the world; least and largest depth of the frame
 
-Depths are integers. Their unit, also that of eyes and bounds, is 0.01 mm, or the smallest larger power of ten in which
-the depths fit 16 bits. The world axes are those of the first camera, where EndoNeRF renders its videos and begins its
+Depths are integers. Their unit, also that of eyes and bounds, is 0.01 mm, or if they exceed 16 bits, 0.1 mm, 1 mm and
+so on. The world axes are those of the first camera, where EndoNeRF renders its videos and begins its
 rays in normalised device coordinates. The loaders assume one focal length and a centred principal point.
 
 Source: med-air/EndoNeRF, load_llff.py (`_load_data`, `load_llff_data`) and run_endonerf_helpers.py (`get_rays`) at

@@ -21,7 +21,7 @@ class Format(NamedTuple):
     required_outputs: tuple[str, ...]  # entries of a scene's `output`
     file_patterns: tuple[str, ...]  # regular expressions, for `list_files`
     optional_outputs: tuple[str, ...] = ()  # further exported entries of `output`
-    numbers_pairs: bool = False  # whether numbers count pairs of frames; otherwise runs
+    numbers_pairs: bool = False  # whether files are numbered by pair of frames, and not by run
     cameras: tuple[str, ...] = ()  # names of the exported cameras, or ANY_CAMERA; empty for a format without camera
     module: str = ""  # name of the module; empty for the name of the format
 

@@ -19,7 +19,7 @@ from taichi_msm.errors import ArgumentError
 from taichi_msm.exports.formats import ANY_CAMERA, FORMATS
 from taichi_msm.model.surface import Solid, refine_surface
 from taichi_msm.render.texture import load_texture
-from taichi_msm.runs.arrays import read_rows
+from taichi_msm.runs.arrays import read_flo, read_rows
 from taichi_msm.runs.directory import MAX_RECORD_BYTES
 from taichi_msm.runs.finished import FinishedRun, damaged_result, reading
 from taichi_msm.scene.outputs import CAMERA_FILE
@@ -126,6 +126,18 @@ def read_depth(run: FinishedRun, frame: int) -> NDArray[np.float32]:
         if not (np.isfinite(depth) & (depth >= 0)).all():
             raise damaged_result(path)
     return depth
+
+
+def read_flow(run: FinishedRun, pair: int) -> NDArray[np.float32]:
+    """Return the optical flow to the right and down [px], shape (height, width, 2).
+
+    Args:
+        run: run with flow, and its camera selected.
+        pair: index of the first of two adjacent frames.
+    """
+    path = run.result_path("flow", pair)
+    with reading(path):
+        return read_flo(path, run.scene.render.size)
 
 
 def read_picture_file(run: FinishedRun, key: str, frame: int) -> bytes:

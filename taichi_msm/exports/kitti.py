@@ -24,10 +24,9 @@ from numpy.typing import NDArray
 
 from taichi_msm.errors import FilesError, ProgressCallback
 from taichi_msm.exports.formats import ExportSource
-from taichi_msm.exports.inputs import read_picture_file
-from taichi_msm.runs.arrays import read_flo
+from taichi_msm.exports.inputs import read_flow, read_picture_file
 from taichi_msm.runs.directory import write_new_file
-from taichi_msm.runs.finished import FinishedRun, reading
+from taichi_msm.runs.finished import FinishedRun
 from taichi_msm.scene.outputs import OUTPUTS, zero_padded
 
 # Folders, each with the entry of `output` that it contains.
@@ -60,9 +59,7 @@ def _write_run(run: FinishedRun, training: Path, first: int, progress: ProgressC
     flow_occ, flow_noc, image_2 = (training / name for name in SOURCE_OUTPUTS)
     for pair in range(pairs):
         progress(pair, pairs)
-        source, name = run.result_path("flow", pair), zero_padded(first + pair)
-        with reading(source):
-            flow = read_flo(source, run.scene.render.size)
+        flow, name = read_flow(run, pair), zero_padded(first + pair)
         write_new_file(flow_occ / f"{name}_10.png", png16(encode_flow(flow)))
         if run.has_output("occlusion"):
             visible = run.read_picture("occlusion", pair)[..., 0] == 0

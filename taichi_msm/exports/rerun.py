@@ -1,7 +1,7 @@
 """Rerun export: a recording per run, for the viewer of rerun.io.
 
     world/sheet             mesh of the mass points with the picture of the scene
-    world/tools/0           capsule of the instrument of a probe, by the number of the probe
+    world/tools/0           mesh of the instrument of a probe, by the number of the probe
     world/tracks            positions of the tracked points
     world/camera            pose and pinhole of the camera; world/cameras/NAME for each of several
     world/camera/picture    frames
@@ -30,6 +30,7 @@ from taichi_msm.exports.inputs import (
     EXPORT_REFINE,
     instrument_mesh,
     read_depth,
+    read_flow,
     read_picture_file,
     read_track_positions,
     unit_normals,
@@ -38,8 +39,7 @@ from taichi_msm.model.surface import place_instruments, refine_surface
 from taichi_msm.render.camera import OPENCV_SIGNS, View, calibration, is_moving, view_at
 from taichi_msm.render.labels import NO_FLOW
 from taichi_msm.render.texture import load_texture
-from taichi_msm.runs.arrays import read_flo
-from taichi_msm.runs.finished import FinishedRun, reading
+from taichi_msm.runs.finished import FinishedRun
 from taichi_msm.scene.outputs import OUTPUTS
 
 try:
@@ -144,9 +144,7 @@ def _log_pictures(run: FinishedRun, frame: int, entity: str, recording: Any) -> 
     if run.has_output("depth"):
         recording.log(f"{entity}/depth", rerun.DepthImage(read_depth(run, frame), meter=1.0))
     if run.has_output("flow") and frame < OUTPUTS["flow"].count(run.frames):
-        path = run.result_path("flow", frame)
-        with reading(path):
-            flow = read_flo(path, run.scene.render.size)
+        flow = read_flow(run, frame)
         largest = float(np.abs(flow[flow < NO_FLOW / 2]).max(initial=1.0))
         tensor = rerun.Tensor(flow, dim_names=("height", "width", "right and down"), value_range=(-largest, largest))
         recording.log(f"{entity}/flow", tensor)

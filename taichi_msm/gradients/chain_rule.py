@@ -187,7 +187,7 @@ class LoadGradient:
     """Derivatives with respect to the loads, accumulated over blocks of steps.
 
     Attributes:
-        by_key: derivatives by key, as `Derivatives.numbers`.
+        by_key: derivatives by key, as in `Derivatives.numbers`.
     """
 
     def __init__(self, plan: Plan) -> None:

@@ -153,7 +153,7 @@ class Adjoint:
         return replace(plan, material=material, stable_step=limit)
 
 
-# Function of the positions at every frame. It returns the value of a loss, and its derivative of the same shape.
+# Loss, a function of the positions at every frame. Returns its value, and its derivative in the shape of the positions.
 Loss = Callable[[Array], tuple[float, Array]]
 
 
@@ -174,7 +174,7 @@ def gradient(scene: Scene | Mapping[str, Any], loss: Loss, threads: int | None =
         scene: scene from `load_scene`, or a mapping of its keys.
         loss: function of the positions at every frame [m], shape (F + 1, rows, cols, 3). It returns its value and its
             derivative with respect to the positions, an array of the same shape.
-        threads: number of CPU threads; None for every core.
+        threads: number of CPU threads; None for all cores.
 
     Returns:
         The value of the loss and its derivatives.

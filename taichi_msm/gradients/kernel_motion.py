@@ -143,7 +143,7 @@ def _build_run_worker(step_band: Callable[..., None], *, parallel: bool) -> Call
 
 
 def _build_store_moments(code: KernelConfig) -> list[Callable[..., None]]:
-    """Return a list of the function that stores the moments for row i of a band; empty without bending.
+    """Return a list with the function that stores the moments for row i of a band; empty without bending.
 
     The first row of a band needs the moments of three rows; each further row adds one.
     """

@@ -49,7 +49,7 @@ CHECKPOINT_PATTERNS = (
     r"(?:manifest\.json|positions|forces)",  # of earlier versions
 )
 
-# Numbers of a `TipForce`, its tip and force, and of a `PeakForce`, its time and force.
+# Numbers per `TipForce` (tip, force) and per `PeakForce` (time, force).
 FORCE_COLUMNS, PEAK_FORCE_COLUMNS = 6, 4
 
 
@@ -183,7 +183,7 @@ def _damaged(path: Path) -> DamagedError:
 
 
 class Checkpoint:
-    """Checkpoint folder of a run. It is valid at every moment at which the process may be killed.
+    """Checkpoint folder of a run, which is valid whenever the process is killed.
 
     Args:
         folder: path inside the staging folder; `begin` creates it.
@@ -352,7 +352,7 @@ class Checkpoint:
 
 
 def _to_arrays(saved: Snapshot) -> dict[str, NDArray[Any]]:
-    """Convert a snapshot to arrays, by the names of their fields; tool paths are part of the plan."""
+    """Convert a snapshot, without its probes, to arrays by the names of its fields."""
     greatest = np.array([(peak.time, *peak.force) for peak in saved.felt.greatest]).reshape(-1, PEAK_FORCE_COLUMNS)
     forces = {"forces": _tip_force_array(saved.felt.forces), "greatest": greatest}
     named = {**saved.state._asdict(), **asdict(saved.progress), **forces}

@@ -69,7 +69,7 @@ class Publication:
 
     Args:
         directory: destination; created if missing.
-        spec: kind of the publication.
+        spec: files of the publication, and content of its record.
         names: names of all files that may be published; checked for conflicts with foreign files.
 
     Raises:
@@ -460,7 +460,7 @@ def lock_file(path: Path) -> BinaryIO:
 
 
 def _try_lock(file: BinaryIO) -> bool:
-    """Lock an open file; return False if the file system has no locks."""
+    """Lock an open file; return False if the file system has no locks, raise a BlockingIOError if it is locked."""
     try:
         if sys.platform == "win32":
             msvcrt.locking(file.fileno(), msvcrt.LK_NBLCK, 1)

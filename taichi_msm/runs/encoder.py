@@ -151,7 +151,7 @@ def _write_still(picture: Picture, path: Path) -> float:
 
 
 class Encoder:
-    """Child process that encodes pictures.
+    """Encoder of pictures in a child process, with the methods of `PictureWriter`.
 
     Args:
         job: formats, destinations and size of the pictures.

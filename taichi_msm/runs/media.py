@@ -1,9 +1,8 @@
 """Streaming writers of animated GIF and MP4.
 
-GIF: all frames share a palette, and their times are exact to 10 ms at any frame rate. At most two frames are queued,
-whereas Pillow's writer keeps all frames in memory; for RGB pictures, it also computes a palette per frame, which takes
-24 times longer. A frame of 512 x 512 pixels of shaded tissue takes 4 ms and 89 kB. Floyd-Steinberg dithering would take
-7 ms and 115 kB, and flicker.
+GIF: all frames share a palette, and their times are exact to 10 ms at any frame rate. At most two frames are queued.
+Pillow's writer keeps all frames in memory, and computes a palette for each one, which takes 24 times longer. A frame of
+512 x 512 pixels of shaded tissue takes 4 ms and 89 kB; with Floyd-Steinberg dithering, 7 ms and 115 kB, with flicker.
 
 MP4: H.264, encoded by PyAV, whose wheels include the encoder (`docs/decisions/0029`).
 """
@@ -92,7 +91,7 @@ class GifWriter:
         self._palette = palette
         self._frames = 0
         self._latest: Picture | None = None
-        # Start times [1/100 s] and palette indices. Two are queued, because a short last frame shortens the other.
+        # Start time [1/100 s] and palette indices of two frames, because a short last frame shortens its predecessor.
         self._queue: deque[tuple[int, Picture]] = deque()
         self._screen: Picture | None = None
         self._file = file

@@ -110,8 +110,8 @@ def run(
             stops the run; after a KeyboardInterrupt, finished frames are kept.
 
     Returns:
-        The content of run.json. Its "status" is "complete", "diverged" ("error" then contains the location and the
-        cause) or "interrupted". `resume` continues diverged, interrupted and killed runs.
+        The content of run.json. Its "status" is "complete", "interrupted" or "diverged", with the location and the
+        cause in "error". `resume` continues diverged, interrupted and killed runs.
 
     Raises:
         ArgumentError: when an argument is invalid.
@@ -195,7 +195,7 @@ def resume(
 
 
 def _find_unfinished(context: _RunContext) -> Manifest | None:
-    """Return the manifest with the versions of the unfinished run; None unless that has the same bits and estimate."""
+    """Return the manifest with the versions of the unfinished run; None unless both have the same bits and estimate."""
     try:
         unfinished, _ = read_manifest(context.directory)
     except (FilesError, SceneError):
@@ -351,7 +351,7 @@ class _Run:
     def save_finished_frames(self) -> dict[str, Any]:
         """Save the state and the finished frames of an interrupted run; reraise if there is no new frame."""
         writer, simulation = self._writer, self._simulation
-        # The saved state continues after the stored frames, and the last simulated frame may not be stored.
+        # A saved state needs all of its frames, and the last simulated frame may not be stored yet.
         if simulation.steps > 0 and simulation.frame < writer.stored_frames and not simulation.inconsistent:
             # A divergence within this frame will recur in the resumed run.
             with suppress(DivergedError):

@@ -214,7 +214,7 @@ class Simulation:
         """Continue from the last frame with another material; shape, velocities, time and probes stay.
 
         Args:
-            scene: differs from the current scene in the values of `tissue`, `springs` and `damping` only.
+            scene: the current scene with other values of `tissue`, `springs` and `damping`.
 
         Raises:
             SceneError: as for `Simulation`.

@@ -283,7 +283,7 @@ _LABEL_WRITERS: dict[str, Callable[[BinaryIO, Any], None]] = {
 
 
 class ErrorRecord(TypedDict):
-    """Error estimate of a run, relative to the largest displacement; None if unknown, for example after divergence."""
+    """Estimated errors of a run, relative to the largest displacement. Unknown ones are None, as after a divergence."""
 
     error: float | None  # largest error of any mass point in any frame, due to step and rounding; None if quasi-static
     rounding: float | None  # share of `error` due to f32; None if not separated by the companion runs
@@ -291,9 +291,9 @@ class ErrorRecord(TypedDict):
     order: int | None  # of the method; None if quasi-static
     at_least: bool  # whether `error` is a lower bound
     mesh_error: NotRequired[float | None]  # discretisation error; only with tissue
-    mesh_doubt: NotRequired[str]  # why `mesh_error` may be larger or is unknown; empty if it is reliable
+    mesh_doubt: NotRequired[str]  # reason for a larger or an unknown `mesh_error`; empty if it is reliable
     force_error: NotRequired[float | None]  # of position-controlled tools, relative to the greatest force
-    force_doubt: NotRequired[str]  # why `force_error` is unknown
+    force_doubt: NotRequired[str]  # reason for an unknown `force_error`
 
 
 class RunRecord(TypedDict, total=False):
