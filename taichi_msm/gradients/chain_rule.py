@@ -50,7 +50,7 @@ class SheetGradient:
     first_gain: float = 0.0  # logarithm of the gain of step 0
 
     def work(self, plan: Plan) -> float:
-        """Return the derivative with respect to the logarithm of a common factor of all internal forces."""
+        """Return p . F of internal forces F, the derivative with respect to the logarithm of their common factor."""
         factors, material = plan.material.factors, plan.material
         assert factors is not None
         total = float(self.tensions @ material.tensions) + float(self.foundation.sum()) + self.bending
@@ -100,7 +100,7 @@ def scene_derivatives(plan: Plan, gradient: SheetGradient, loads: LoadGradient) 
     if kind == "tissue" and material.virtual > 0:
         factors = material.virtual_factors
         maps["tissue.foundation_map"] = gradient.foundation / (1.0 if factors is None else factors)
-    return Derivatives(numbers | loads.by_key, maps)
+    return Derivatives({**numbers, **loads.by_key}, maps)
 
 
 def _sheet_coefficients(plan: Plan, scene: Scene) -> NDArray[Any]:
@@ -192,7 +192,7 @@ class LoadGradient:
 
     def __init__(self, plan: Plan) -> None:
         self._plan = plan
-        self.by_key: dict[str, float | Array] = {}
+        self.by_key: dict[str, Array] = {}
         self._slots = {
             index: [n for n, slot in enumerate(plan.slots) if slot.probe == index]
             for index in sorted({slot.probe for slot in plan.slots})
@@ -216,23 +216,18 @@ class LoadGradient:
         for index, slots in self._slots.items():
             probe, by_force, by_point = self._plan.scene.probes[index], by_slot[:, slots, :3], by_slot[:, slots, 3:]
             unit = schedule_of(self._with_probe(index, {_force_key(probe): (1.0, 1.0, 1.0)})).strength
-            self._derivatives(index, _force_key(probe))[:] += (by_force * unit).sum(axis=(0, 1))
+            self.by_key[f"probes.{index}.{_force_key(probe)}"] += (by_force * unit).sum(axis=(0, 1))
             keys = [time for time, _ in probe.load]
             for n in _active_keys(keys, times):
                 load = tuple((time, float(m == n)) for m, time in enumerate(keys))
                 unit = schedule_of(self._with_probe(index, {"load": load})).strength
-                self._derivatives(index, "load")[n] += (by_force * unit).sum()
-            by_position = self._derivatives(index, "at").reshape(-1, 2)
+                self.by_key[f"probes.{index}.load"][n] += (by_force * unit).sum()
+            by_position = self.by_key[f"probes.{index}.at"].reshape(-1, 2)
             keys = control_points(probe, self._plan.scene.sheet)[0].tolist()
             # Unlike the load, the control point is not 0 before the first keyframe.
             for n in _active_keys(keys, times, before=True):
                 share = schedule_of(self._with_unit_position(index, n)).point
                 by_position[n] += (by_point * share).sum(axis=(0, 1)) * (width, -height)
-
-    def _derivatives(self, index: int, name: str) -> Array:
-        derivatives = self.by_key[f"probes.{index}.{name}"]
-        assert isinstance(derivatives, np.ndarray)
-        return derivatives
 
     def _with_probe(self, index: int, changes: dict[str, Any]) -> Plan:
         """Return a plan with a changed probe, and with the slots of this probe only."""

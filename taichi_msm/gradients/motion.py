@@ -205,7 +205,8 @@ class MotionAdjoint:
             return np.zeros(2)
         loads.add(lambda plan: average_loads(plan, first, end - first), by_slot, (first * h - h, end * h))
         work = (by_slot[..., :3] * average_loads(self.plan, first, end - first).strength).sum(axis=(1, 2))
-        return np.array([work[int(first == 0) :].sum(), work[: int(first == 0)].sum()])
+        first_steps = 1 if first == 0 else 0
+        return np.array([work[first_steps:].sum(), work[:first_steps].sum()])
 
     def _store_checkpoint(self, segment: int) -> None:
         sheet, first = self._forward.sheet.kernel.arrays, segment * self._step_entries
@@ -214,6 +215,7 @@ class MotionAdjoint:
 
     @property
     def _step_entries(self) -> int:
+        """Number of entries of an array per step."""
         return self.layout.rows * self.layout.width
 
     def _copy_step(self, from_entry: int, to_entry: int, source: list[Any], target: list[Any]) -> None:
@@ -253,9 +255,11 @@ class MotionAdjoint:
         """
         layout, grid, count = self.layout, self.plan.grid, len(table)
         frame, steps_after_frame = divmod(end - count, grid.steps_per_frame)
-        if not steps_after_frame:
+        with_loss = steps_after_frame == 0
+        if with_loss:
             self._write_loss(by_frame[frame])
-        sizes = self._sizes(count, end - first - 1, kernels.ADJOINT_PARTS * layout.rows, not steps_after_frame)
+        moment_row = kernels.ADJOINT_PARTS * layout.rows
+        sizes = self._sizes(count, end - first - 1, moment_row, buffer=self._buffer, with_loss=with_loss)
         columns = kernels.LOAD_DERIVATIVES * len(self.plan.slots)
         by_row = np.zeros((count, layout.rows, max(1, columns)))
         self._launch(
@@ -272,11 +276,13 @@ class MotionAdjoint:
         return by_row[..., :columns].sum(axis=1).reshape(count, -1, kernels.LOAD_DERIVATIVES)
 
     def _write_loss(self, by_displacement: Array) -> None:
+        """Write the derivative of the loss with respect to the displacements of a frame to the adjoint's arrays."""
         for c in range(3):
             write_vectors(self._loss[c], to_lanes(self.layout, by_displacement[..., c]))
         self._copy_step(0, kernels.LOSS * self._step_entries, self._loss, self._adjoint)
 
     def _sheet_gradient(self, gain: float, work: Array) -> SheetGradient:
+        """Collect the accumulated derivatives; `work` is the sum of `_sweep_block` over all blocks."""
         layout = self.layout
         rows, cols, derivatives = layout.rows, layout.cols, self._derivatives.to_numpy()
         parts = from_lanes(layout, derivatives, kernels.SUM_PARTS * rows).reshape(kernels.SUM_PARTS, rows, cols)
@@ -302,15 +308,18 @@ class MotionAdjoint:
         return arrays.constants, arrays.by_column, arrays.stiffness, arrays.fields
 
     def _max_launch_steps(self) -> int:
-        # Steps times mass points of about 0.1 s on one core.
+        # 10 million steps of a mass point take about 0.1 s on one core.
         return max(1, 10_000_000 // (self.layout.rows * self.layout.cols))
 
-    def _sizes(self, count: int, u_step: int, moment_row: int, with_loss: bool = False) -> NDArray[np.int64]:
+    def _sizes(
+        self, count: int, u_step: int, moment_row: int, *, buffer: int = 0, with_loss: bool = False
+    ) -> NDArray[np.int64]:
+        """Return the sizes of a launch in the order of `kernel_motion`, from COUNT on."""
         layout = self.layout
         carry = moment_row + MOMENT_ROWS * layout.workers
         return np.array([
             count, layout.workers, layout.rows, layout.strip, u_step, moment_row, carry, self._carried_rows,
-            MAX_WAIT_CHECKS, self._buffer if moment_row == kernels.ADJOINT_PARTS * layout.rows else 0, with_loss,
+            MAX_WAIT_CHECKS, buffer, with_loss,
         ])  # fmt: skip
 
     def _launch(self, build: Callable[..., Callable[..., None]], sizes: NDArray[np.int64], *arguments: Any) -> None:

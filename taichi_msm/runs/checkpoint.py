@@ -234,7 +234,6 @@ class Checkpoint:
 
     def reopen(self) -> Snapshot | None:
         """Open the checkpoint of an earlier run; return its last saved state, or None for the initial state."""
-        self.close()
         saved = self.load()
         self.frames = 0 if saved is None else saved.progress.frame + 1
         if self._plan.scene.output:
