@@ -81,12 +81,12 @@ def _require_central(camera: Pinhole, size: tuple[int, int], run: FinishedRun) -
     x, y = (camera.centre - np.array(size) / 2).tolist()
     faults = []
     if abs(focal_x / focal_y - 1) > 1e-6:
-        faults.append(f"its focal lengths are {focal_x:g} and {focal_y:g} px")
+        faults.append(f"the focal lengths are {focal_x:g} and {focal_y:g} px")
     # The loaders' principal point is the centre of the pixel to the lower right of the picture's centre.
     if max(abs(x), abs(y)) > 0.5 + 1e-6:
-        faults.append(f"its principal point is {x:g} px to the right of and {y:g} px below the centre")
+        faults.append(f"the principal point is {x:g} px to the right of and {y:g} px below the centre")
     if faults:
-        fault = f"{FORMAT_NAME} needs one focal length and a centred principal point, and {' and '.join(faults)}"
+        fault = f"{FORMAT_NAME} needs one focal length and a centred principal point; {', '.join(faults)}"
         width, height = size[0] / 2, size[1] / 2
         remedy = f"run the scene with fx = fy, cx: {width:g} and cy: {height:g}, or with fov"
         raise ArgumentError(f"{run.directory / run.camera}: {fault}; {remedy}")

@@ -199,5 +199,5 @@ def read_runs(directories: Sequence[str | Path]) -> tuple[list[FinishedRun], int
         incomplete += count - len(complete)
         runs += complete
     if not runs:
-        raise FilesError(f"{', '.join(map(str, directories))}: no run is complete; their table.csv has the reasons")
+        raise FilesError(f"{', '.join(map(str, directories))}: no run is complete; table.csv has the reasons")
     return runs, incomplete

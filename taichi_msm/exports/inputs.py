@@ -199,7 +199,7 @@ def read_pinhole(run: FinishedRun, name: str) -> Pinhole:
         raise ArgumentError(f"{fault}; {alternative}run the scene with a pinhole camera")
     if is_distorted:
         fault = f"{path}: the camera has lens distortion, which {name} cannot describe"
-        raise ArgumentError(f"{fault}; {alternative}run the scene without it")
+        raise ArgumentError(f"{fault}; {alternative}run the scene without distortion")
     with reading(path):
         matrix = np.array(camera["intrinsics"], float)
         poses = np.array(camera.get("poses", [camera["pose"]] * run.frames), float)[: run.frames]

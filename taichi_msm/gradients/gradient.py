@@ -35,8 +35,9 @@ def require_differentiable(plan: Plan) -> None:
         SceneError: when it has position-controlled tools, or another term without a gradient.
     """
     for tool in plan.tools:
-        reason = "a tool with a path has no gradient, as points meet and leave it; fit such scenes by differences"
-        raise SceneError([f"probes.{tool.probe}.path: {reason}"])
+        reason = "a tool with a path has no gradient, as its contact begins and ends"
+        remedy = "fit numbers instead of a map, or take finite differences"
+        raise SceneError([f"probes.{tool.probe}.path: {reason}; {remedy}"])
     for term in build_terms(plan):
         if not term.has_gradient:
             reason = "has no gradient, which the fit of a map needs; remove it, or fit numbers"
