@@ -110,6 +110,7 @@ def _choose_tracks(runs: Sequence[FinishedRun], radius: int) -> tuple[Pixels, in
         Pixels per camera in the first and last frame, shape (2, 2, tracks, 2); and the number of all tracks.
     """
     tracks, occluded = (np.stack(each)[:, :, [0, -1]] for each in zip(*map(read_tracks, runs), strict=True))
+    # From the axes camera, track, frame, component to camera, frame, track, component.
     pixels = np.floor(np.nan_to_num(tracks)).astype(np.int64).transpose(0, 2, 1, 3)
     inside = ((pixels >= radius) & (pixels < np.array(runs[0].scene.render.size) - radius)).all(axis=(0, 1, 3))
     chosen: list[int] = []

@@ -119,6 +119,7 @@ def _coefficient_gradient(plan: Plan, gradient: SheetGradient) -> Array:
     unit = spring_stiffness(replace(material, across=1.0, down=1.0, shear=1.0), material.factors)
     # The derivatives with respect to tau = k e at constant k: k - tau decreases with tau.
     tensions = gradient.tensions - [float(by_spring.sum()) for by_spring in gradient.springs]
+    # A stiffness changes the k of its springs, and their tau = k e.
     springs = [
         float((by_spring * share).sum()) + material.tension * tension
         for by_spring, share, tension in zip(gradient.springs, unit, tensions, strict=True)

@@ -66,6 +66,13 @@ SPRING_PARTS, FOUNDATION_PART, SUM_PARTS = 0, 3, 4
 # ROW_SUMS              number of sums
 KEEP_SUM, TENSION_SUMS, BENDING_SUM, LOCK_SUMS, FOUNDATION_LOCK_SUMS, ROW_SUMS = 0, 1, 4, 5, 7, 9
 
+# Indices of the results of `SpringTerm.build_spring_tangent`. After the change of the force, 3, the derivatives with
+# respect to
+# BY_STIFFNESS  k - tau
+# BY_TENSION    tau
+# BY_LOCK       log(lock) and factor, only of springs that lock
+BY_STIFFNESS, BY_TENSION, BY_LOCK = 3, 4, 5
+
 # Derivatives per slot, step and row: with respect to the force, 3, and the control point, 2.
 LOAD_DERIVATIVES = 5
 
@@ -256,12 +263,12 @@ def _build_sweep_row(code: KernelConfig) -> Callable[..., None]:
     probes, foundation_term = code.require(ProbeTerm), code.get(FoundationTerm)
     laplacians = [] if code.get(BendingTerm) is None else [build_laplacian(code)]
     add_load_derivatives = probes.build_load_adjoint(code, SUM_PARTS)
-    slots, standing = len(probes.moves), probes.moves.count(False)
+    slots, stationary = len(probes.moves), probes.moves.count(False)
     foundation = code.first_column(FoundationTerm) if foundation_term else 0
     foundation_derivatives = [foundation_term.build_derivatives(code)] if foundation_term else []
     shares = [foundation_term.build_share(code)] if foundation_term and foundation_term.locks else []
     locks = springs.law.parameter_count > 0
-    results = 7 if locks else 5
+    results = BY_LOCK + 2 if locks else BY_LOCK
 
     @ti.func
     def spring_tangent(sheet: ti.template(), offset, p, q, x0, y0, length, k, family: ti.template()):
@@ -342,10 +349,10 @@ def _build_sweep_row(code: KernelConfig) -> Callable[..., None]:
                         sheet.u[c][(band.target + i) * width + b] = p[c] + q[c]
                     # A spring pulls its ends in opposite directions.
                     if ti.static(structural):
-                        add(sheet.derivatives, (ALONG_ROW * sheet.rows + i) * width + b, right[3] * (-1.0))
-                        add(sheet.derivatives, (ALONG_COLUMN * sheet.rows + i) * width + b, down[3] * (-1.0))
+                        add(sheet.derivatives, (ALONG_ROW * sheet.rows + i) * width + b, right[BY_STIFFNESS] * (-1.0))
+                        add(sheet.derivatives, (ALONG_COLUMN * sheet.rows + i) * width + b, down[BY_STIFFNESS] * (-1.0))
                     if ti.static(shear):
-                        diagonals = falling[3] + rising[3]
+                        diagonals = falling[BY_STIFFNESS] + rising[BY_STIFFNESS]
                         add(sheet.derivatives, (DIAGONAL * sheet.rows + i) * width + b, diagonals * (-1.0))
                     for derive in ti.static(foundation_derivatives):
                         index, by_foundation = (FOUNDATION_PART * sheet.rows + i) * width + b, derive(sheet, p, u)
@@ -357,12 +364,14 @@ def _build_sweep_row(code: KernelConfig) -> Callable[..., None]:
                                 sums[at_sum] = sums[at_sum] - k * by_foundation[1 + n]
                     if ti.static(locks):
                         for n in ti.static(range(2)):
-                            springs_here = (right[5 + n] + down[5 + n]) + (falling[5 + n] + rising[5 + n])
-                            sums[LOCK_SUMS + n] = sums[LOCK_SUMS + n] - springs_here
+                            by_lock = ti.static(BY_LOCK + n)
+                            of_springs = (right[by_lock] + down[by_lock]) + (falling[by_lock] + rising[by_lock])
+                            sums[LOCK_SUMS + n] = sums[LOCK_SUMS + n] - of_springs
                     if ti.static(tension):
-                        sums[TENSION_SUMS + ALONG_ROW] = sums[TENSION_SUMS + ALONG_ROW] - right[4]
-                        sums[TENSION_SUMS + ALONG_COLUMN] = sums[TENSION_SUMS + ALONG_COLUMN] - down[4]
-                        sums[TENSION_SUMS + DIAGONAL] = sums[TENSION_SUMS + DIAGONAL] - (falling[4] + rising[4])
+                        sums[TENSION_SUMS + ALONG_ROW] = sums[TENSION_SUMS + ALONG_ROW] - right[BY_TENSION]
+                        sums[TENSION_SUMS + ALONG_COLUMN] = sums[TENSION_SUMS + ALONG_COLUMN] - down[BY_TENSION]
+                        of_diagonals = falling[BY_TENSION] + rising[BY_TENSION]
+                        sums[TENSION_SUMS + DIAGONAL] = sums[TENSION_SUMS + DIAGONAL] - of_diagonals
                     if ti.static(code.by_area):
                         keep_sum *= sheet.by_column[(AREA_SHARE + kind) * width + b]
                     sums[KEEP_SUM] += keep_sum
@@ -381,7 +390,7 @@ def _build_sweep_row(code: KernelConfig) -> Callable[..., None]:
                 to_next[c] = right[c] - rising[c]
                 to_below[c] = falling[c]
         if owned:
-            first = (SUM_PARTS + 2 * standing) * sheet.rows * width + ROW_SUMS * i
+            first = (SUM_PARTS + 2 * stationary) * sheet.rows * width + ROW_SUMS * i
             for n in ti.static(range(ROW_SUMS)):
                 add(sheet.derivatives, first + n, sums[n])
             for n in ti.static(range(LOAD_DERIVATIVES * slots)):

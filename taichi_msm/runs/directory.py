@@ -243,12 +243,12 @@ def entry_kind(path: Path) -> str | None:
     return "a symbolic link" if stat.S_ISLNK(mode) else "a pipe or a device"
 
 
-def require_kind(path: Path, wanted: str) -> Path:
+def require_kind(path: Path, kind: str) -> Path:
     """Require that an entry is of the expected kind, or missing.
 
     Args:
         path: entry of a directory; links are not followed.
-        wanted: expected kind, FILE or FOLDER.
+        kind: expected kind, FILE or FOLDER.
 
     Returns:
         The path.
@@ -256,7 +256,7 @@ def require_kind(path: Path, wanted: str) -> Path:
     Raises:
         ForeignError: when the entry is of another kind, such as a link.
     """
-    if (actual := entry_kind(path)) not in (None, wanted):
+    if (actual := entry_kind(path)) not in (None, kind):
         raise ForeignError.at(path, str(actual))
     return path
 

@@ -124,11 +124,12 @@ class GifWriter:
         return round(100 * frame / self._rate)
 
     def _write_last(self, indices: Picture) -> None:
-        """Write the queued frames, and the latest frame at the end."""
+        """Write the queued frames, with the latest frame in place of the last one."""
         first, last = self._queue[0][0], self._queue.pop()[0]
         end = self._centiseconds(self._frames)
         start = min(last, end - MIN_GIF_DELAY)
         if start - first < MIN_GIF_DELAY:
+            # The frame before would be too short, or does not exist.
             self._queue.clear()
             start = first
         else:

@@ -331,8 +331,8 @@ class _Run:
             with self._stopwatch.stage("pilot"):
                 forces = None  # unknown before the resumption
                 if frame >= self._resumed_frames:
-                    probes = self._simulation.forces()
-                    forces = np.array([probes[tool.probe].force for tool in self._context.plan.tools]).reshape(-1, 3)
+                    by_probe = self._simulation.forces()
+                    forces = np.array([by_probe[tool.probe].force for tool in self._context.plan.tools]).reshape(-1, 3)
                 self._error_estimator.compare_frame(displacement, pause, forces)
 
     def _refine_estimate(self) -> None:
@@ -413,7 +413,7 @@ class _Run:
             for record, peak in zip(probe_records(scene), self._simulation.felt.greatest, strict=True)
         ]
         notes = [
-            *run_warnings(plan, probes, progress, estimates, _takes_an_hour_at_most, _pixels_per_metre(scene)),
+            *run_warnings(plan, probes, progress, estimates, _runs_within_an_hour, _pixels_per_metre(scene)),
             *(self._path_dependence.warnings() if self._path_dependence else ()),
             *drawing_warnings(scene),
         ]
@@ -458,7 +458,7 @@ def _choose_companions(context: _RunContext, *, resumed: bool) -> CompanionRuns:
     return companions
 
 
-def _takes_an_hour_at_most(plan: Plan) -> bool:
+def _runs_within_an_hour(plan: Plan) -> bool:
     return cost.estimate_duration(plan).seconds <= 3600
 
 

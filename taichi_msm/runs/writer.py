@@ -243,10 +243,10 @@ class LabelWriter:
         for output in self._frame_outputs:
             number = frame - 1 if output.is_frame_pair else frame
             if number >= 0:
-                path = self._folder / output.path(number)
+                labels, path = getattr(observed, output.source), self._folder / output.path(number)
                 path.parent.mkdir(exist_ok=True)
                 with create_file(path) as file:
-                    _LABEL_WRITERS[path.suffix](file, getattr(getattr(observed, output.source), output.name))
+                    _LABEL_WRITERS[path.suffix](file, getattr(labels, output.name))
         if observed.tracks is not None:
             self._pixels[:, frame], self._occluded[:, frame] = observed.tracks
             self._position[:, frame] = surface_positions(position, self._scene.render.refine, self._grid)
