@@ -69,7 +69,7 @@ def export(
     Args:
         runs: folder of a run, or of a sweep, whose complete runs are exported; or a sequence of folders.
         format: kitti, tapvid, tapvid3d, stir, endonerf, rerun, vtk, gltf, obj or csv.
-        out: destination; None for export-FORMAT in the folder of a single run or sweep, or in output for several.
+        out: destination; None for a folder export-FORMAT, in that of a single run or sweep, or in output/ for several.
         progress: called with the finished and the total number of frames; an exception in it cancels the export and
             leaves all files unchanged.
         camera: for runs with several cameras, the name of the camera whose pictures, labels and tracks are exported.

@@ -225,7 +225,7 @@ class Checkpoint:
         self._manifest = json.dumps(manifest).encode()
         if self._plan.scene.output:
             # Unbuffered, so that stored frames survive when the process is killed.
-            self._file = create_file(self._frames_path, buffering=0)
+            self._file = self._frames_path.open("x+b", buffering=0)
         self._write_state({})
 
     def invalidate(self) -> None:

@@ -414,20 +414,9 @@ def link_without_replacing(draft: Path, path: Path) -> bool:
     return True
 
 
-def create_file(path: Path, buffering: int = -1) -> BinaryIO:
-    """Create a file and open it for writing and reading.
-
-    Args:
-        path: new path in an existing folder.
-        buffering: size of the buffer [bytes], as for `open`; -1 for its default, 0 for none.
-
-    Returns:
-        The open file.
-
-    Raises:
-        FileExistsError: when the path exists.
-    """
-    return path.open("x+b", buffering)
+def create_file(path: Path) -> BinaryIO:
+    """Create a file, and open it for writing and reading; raise a FileExistsError if it exists."""
+    return path.open("x+b")
 
 
 def write_new_file(path: Path, data: bytes) -> None:
