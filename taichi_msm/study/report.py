@@ -1,4 +1,4 @@
-"""Report of a study: JSON, a page in Markdown, a figure, and a summary for the terminal."""
+"""Report of a study: JSON, a page in Markdown, a figure, and the summary for the terminal."""
 
 from __future__ import annotations
 
@@ -38,26 +38,20 @@ WITHOUT_MATPLOTLIB = "study.png needs matplotlib: pip install matplotlib"
 
 
 def require_writable(directory: Path) -> None:
-    """Check that a directory can be written.
-
-    Raises:
-        FilesError: when it cannot be written.
-    """
+    """Raise a FilesError if a directory cannot be written."""
     with writing(directory), hidden_folder(directory):
         pass
 
 
 def write_report(study: Study, directory: Path) -> list[str]:
-    """Write the report of a study, replacing an earlier one; other files in the directory remain.
-
-    Every file is written atomically, study.json last.
+    """Write the report of a study, in place of an earlier one; other files in the directory remain.
 
     Args:
         study: the results; receives a note if the figure cannot be plotted.
         directory: directory of the report.
 
     Returns:
-        Names of the files, study.json last.
+        Names of the files, each written atomically, study.json last.
 
     Raises:
         FilesError: when the directory cannot be written.
@@ -96,7 +90,7 @@ def _as_data(value: Any) -> Any:
 
 
 def _draw(study: Study, path: Path) -> bool:
-    """Plot the figure if Matplotlib is installed and a panel has data; return whether it was plotted."""
+    """Plot the figure if Matplotlib is installed and there are data to plot; return whether it was plotted."""
     try:
         from taichi_msm.study.plot import panels, plot
     except ImportError:
@@ -166,7 +160,7 @@ def format_page(study: Study) -> str:
 
 
 def format_summary(study: Study) -> str:
-    """Format the main results for the terminal, followed by the recommended lines of a scene file."""
+    """Format the main results, and the recommended lines of a scene file, for the terminal."""
     lines = [f"{printable(study.scene)} on {machine_summary(study)}"]
     if study.reference is not None:
         lines.append(
@@ -194,7 +188,7 @@ def format_summary(study: Study) -> str:
 
 
 def remarks(study: Study) -> Iterator[str]:
-    """Yield remarks on the recommendation and on the discretisation error (mesh)."""
+    """Yield remarks on a missing step and on the discretisation error of the mesh."""
     mesh, recommended = study.scene_mesh, study.recommended_points
     if recommended is None and study.best_stepping is None:
         yield _shortfall(study)
@@ -224,7 +218,7 @@ def remarks(study: Study) -> Iterator[str]:
 
 
 def _shortfall(study: Study) -> str:
-    """Return the reason why no step is recommended, and a remedy."""
+    """Return the reason why no step is recommended, and the remedy."""
     closest = _best(study.stepping, study.tolerance)
     if closest is None:
         return "No step is recommended: none was measured."
@@ -271,7 +265,7 @@ def _meshes(study: Study) -> Iterator[str]:
 
 
 def _bounds(points: Sequence[ErrorMeasurement]) -> Iterator[str]:
-    """Yield an explanation of errors that are upper bounds, if there are any."""
+    """Yield an explanation of upper bounds, if an error is one."""
     if any(format_error(point).startswith("<") for point in points):
         yield "An error with < is an approximate upper bound, as the reference is not accurate enough."
 

@@ -35,15 +35,15 @@ def run_study(
     Args:
         scene: the scene or its plan.
         name: name of the scene in the report.
-        tolerance: largest allowed error, as a fraction of the largest displacement; None for the scene's, or 1e-3.
-        quick: whether to measure fewer settings, in about a minute for a small sheet.
+        tolerance: largest allowed error, as a fraction of the largest displacement; by default the scene's, else 1e-3.
+        quick: whether to make fewer and shorter measurements.
         arch: cpu, cuda or vulkan.
         threads: number of CPU threads, by default one per core.
-        progress: called with the stage, the finished and the total number of runs or pictures; a KeyboardInterrupt from
+        progress: called with the stage, and the finished and total number of runs or pictures; a KeyboardInterrupt from
             it ends the study with the results so far.
 
     Returns:
-        The measurements, without a report.
+        The measurements.
 
     Raises:
         SceneError: when the scene is quasi-static, the picture cannot be decoded, or the trajectories do not fit in
@@ -85,7 +85,7 @@ def run_study(
 
 
 def machine_record(device: Device) -> dict[str, Any]:
-    """Return the machine of a study as JSON data."""
+    """Return a record of this machine and its software for a study, as JSON data."""
     return {
         "cpu": process.processor_name(),
         "cores": os.cpu_count(),
@@ -98,7 +98,7 @@ def machine_record(device: Device) -> dict[str, Any]:
 
 def _require_memory(scene: Scene) -> None:
     rows, cols = scene.sheet.points
-    # At most six trajectories: the reference, its extrapolation, and the compared runs.
+    # There are at most six trajectories at a time: reference, its extrapolation, compared runs.
     needed = 6 * scene.time.frames * rows * cols * 3 * 8
     available = process.available_memory()
     if needed > available:

@@ -141,11 +141,10 @@ def parse_message(message: str | bytes) -> Event | None:
         return None
     if not (isinstance(values, list) and values and isinstance(values[0], str) and values[0] in _EVENTS):
         raise ValueError(f"not a list of an event and its values; the events are {', '.join(_EVENTS)}")
-    kind = _EVENTS[values[0]]
     if any(isinstance(value, (int, float)) and not abs(value) <= MAX_VALUE for value in values):
         raise ValueError(f"{values[0]}: a value is not from {-MAX_VALUE:g} to {MAX_VALUE:g}")
     try:
-        event = kind.validate_python(tuple(values[1:]))
+        event = _EVENTS[values[0]].validate_python(tuple(values[1:]))
     except ValidationError as error:
         first = error.errors(include_url=False, include_input=False)[0]
         raise ValueError(f"{values[0]}: {first['msg']}") from None

@@ -43,9 +43,8 @@ class Film:
         self._subframes, self._begin, self._location = subframes, begin, (path.parent, option)
         with writing(*self._location), ExitStack() as opened:
             self._hidden = opened.enter_context(hidden_folder(path.parent))
-            formats = (self._format,)
             job = EncodingJob(
-                (self._hidden,), render.size, rate / subframes, formats, render.background, render.quality
+                (self._hidden,), render.size, rate / subframes, (self._format,), render.background, render.quality
             )
             self._encoder = Encoder(job)
             opened.callback(self._encoder.abort)

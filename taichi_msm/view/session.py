@@ -119,13 +119,16 @@ class Session:
         self.tool = tool
         plan = self._with_tool(tool)
         self.scene = scene.model_copy(update={"probes": plan.scene.probes})
-        self._show_readings, self._show_keys, self.paused = True, False, False
+        self._show_readings, self._show_keys = True, False
+        self._single_step = self._has_warned_of_length = self._material_changed = self.paused = False
         # Elapsed frames, including those of pauses.
         self._elapsed = 0
         self._notice, self._notice_until = "", 0
+        self.divergence_error = ""
         # Moving average of the time to simulate a frame [s].
         self._frame_time_s = 0.0
-        self._reset_status()
+        # Largest force since the last reset [N].
+        self._max_felt_force = 0.0
         progress("compile")
         # One core is left for the browser: workers spin while they wait for each other.
         self._simulation = Simulation(plan, arch, threads, texture, max(1, available_threads() - 1))
@@ -472,9 +475,7 @@ class Session:
 
     def _reset_status(self) -> None:
         self._single_step = self._has_warned_of_length = self._material_changed = False
-        # Largest force since the last reset [N].
-        self._max_felt_force = 0.0
-        self.divergence_error = ""
+        self._max_felt_force, self.divergence_error = 0.0, ""
 
     def _end_film(self) -> None:
         film, self._film = self._film, None

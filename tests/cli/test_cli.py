@@ -327,7 +327,7 @@ def test_check_prints_the_scene_and_its_cost(small: Path, call: Call) -> None:
     assert "falloff: 20.0" in out
     assert "\n99 points, 5 frames, 164 steps of 0.00243902 s (limit 0.00499221 s), 41 a frame, in f64\n" in out
     assert re.search(r"\nabout \d.* to run \(estimated from", out)
-    assert "as time.tolerance may ask" in call("check", "small.yaml", "--set", "time.tolerance=1e-4")[1]
+    assert "if refined for time.tolerance" in call("check", "small.yaml", "--set", "time.tolerance=1e-4")[1]
     assert " of memory, at most 0.1 MiB on disk, " in out
     assert not (small / "output").exists()
     report = json.loads(call("check", "small.yaml", "--json")[1])
