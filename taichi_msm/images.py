@@ -191,7 +191,7 @@ def _count_scans(file: BinaryIO) -> int:
 
 
 def irregular_kind(path: Path) -> str:
-    """Describe what a path is if not a regular file; empty for a regular file.
+    """Return the kind of a path that is not a regular file; empty for a regular file.
 
     The path is not opened: a pipe would block.
     """

@@ -37,7 +37,7 @@ class SuggestingChoice(click.Choice):  # type: ignore[type-arg]  # not generic b
 
 
 def parse_shard(text: str) -> tuple[int, int]:
-    """Parse I/N, part I of N counted from 1."""
+    """Parse I/N: shard I of N, counted from 1."""
     numbers = re.fullmatch("([0-9]{1,9})/([0-9]{1,9})", text)
     if numbers is None or not 1 <= int(numbers[1]) <= int(numbers[2]):
         raise click.BadParameter(f"{text} is not a shard; take I/N with 1 <= I <= N, such as 3/8")

@@ -123,7 +123,7 @@ class SteppingStudy:
         if self._plan.tools:
             before, frames = middle, fine
         largest = max_norm(frames)
-        self._study.reference = Reference(4 * finest, _relative(frames - before, largest), largest)
+        self._study.reference = Reference(4 * finest, _relative_error(frames - before, largest), largest)
         return frames
 
     def _measure_errors(self, difference: str, counts: list[int], exact: Array) -> None:
@@ -132,16 +132,16 @@ class SteppingStudy:
         largest, reference_error = self._study.reference.largest, self._study.reference.error
         remaining, bound = set(PRECISIONS), displacement_bound(self._plan, self._plan.scene.time.duration)
         for steps in counts:
-            double: Array | None = None
+            frames_f64: Array | None = None
             for precision in (each for each in PRECISIONS if each in remaining):
                 step = replace(self._plan.grid, steps_per_frame=steps).step
                 point = SteppingMeasurement(precision, difference, steps, step)
                 frames = self._run(precision, difference, steps, point.samples)
-                error, rounding = _relative(frames - exact, largest), None
+                error, rounding = _relative_error(frames - exact, largest), None
                 if precision == "f64":
-                    double = frames
-                elif double is not None and largest > 0:
-                    rounding = max_norm(frames - double) / largest
+                    frames_f64 = frames
+                elif frames_f64 is not None and largest > 0:
+                    rounding = max_norm(frames - frames_f64) / largest
                 self._study.stepping.append(point)
                 if error < math.inf and max_norm(frames) <= bound:
                     point.error, point.rounding = error, rounding
@@ -167,7 +167,7 @@ class SteppingStudy:
         return frames
 
 
-def _relative(error: Array, largest: float) -> float:
+def _relative_error(error: Array, largest: float) -> float:
     """Return the largest error [m] as a fraction of the largest displacement [m]; 0 without motion."""
     return max_norm(error) / largest if largest > 0 else 0.0
 
@@ -217,13 +217,13 @@ class MeshStudy:
             for plan in mesh_plans(self._plan):
                 seconds = self._measure_mesh(plan, opened)
             if not self._sheets:
-                note = f"points were not measured: a comparison needs at least {MIN_POINTS_PER_SIDE} a side"
+                note = f"meshes were not compared: that takes at least {MIN_POINTS_PER_SIDE} points a side"
                 self._study.notes.append(note)
                 return
             finer = self._finer_plan(self._plan, seconds, self._longest_run)
             if finer is None:
                 rows, cols = _scaled(self._plan, FINE_CELL_RATIO)
-                self._study.notes.append(f"{rows} x {cols} points were not measured: time or memory")
+                self._study.notes.append(f"{rows} x {cols} points were not measured, for lack of time or memory")
             else:
                 seconds = self._measure_mesh(finer, opened)
                 finer = self._finer_plan(finer, seconds, ROUNDS * self._longest_run)
@@ -379,7 +379,7 @@ def measure_pictures(
     memory = process.available_memory() // 2
     finest = _with_render(scene, **REFERENCE_RENDER)
     if cost.drawing_bytes(finest) > memory:
-        study.notes.append("drawing was not measured: the memory is too small for the reference picture")
+        study.notes.append("drawing was not measured, for lack of memory for the reference picture")
         return
     reference = Rasterizer(finest, texture).draw(position)
     drawings, candidates = [], list(render_settings(scene, quick))
@@ -388,7 +388,9 @@ def measure_pictures(
         changed = _with_render(scene, refine=refine, supersample=supersample)
         memory -= cost.drawing_bytes(changed)
         if memory < 0:
-            study.notes.append(f"drawing was not measured from refine {refine}, supersample {supersample} on: memory")
+            study.notes.append(
+                f"drawing was not measured from refine {refine}, supersample {supersample} on, for lack of memory"
+            )
             break
         drawing = Rasterizer(changed, texture)
         drawings.append(drawing)

@@ -140,7 +140,7 @@ def format_page(study: Study) -> str:
         f"Measured on {machine_summary(study)}, with taichi-msm {versions['taichi-msm']}, {compiler_label(versions)}, "
         f"NumPy {versions['numpy']} and Python {versions['python']} ({versions['platform']}). "
         "Times are medians, with the fastest and the slowest in brackets.",
-        *(_stepping(study) if study.stepping else ()),
+        *(_stepping_section(study) if study.stepping else ()),
     ]
     if study.drawing:
         blocks += [
@@ -150,7 +150,7 @@ def format_page(study: Study) -> str:
             _drawings_table(study, study.drawing),
         ]
     if study.points:
-        blocks += _meshes(study)
+        blocks += _mesh_section(study)
     if study.notes:
         blocks += ["## Notes", "\n".join(f"- {note}" for note in study.notes)]
     blocks += ["## Recommendation", *remarks(study)]
@@ -180,7 +180,7 @@ def format_summary(study: Study) -> str:
     if study.points:
         blocks.append(_meshes_table(study))
     notes = [f"note: {printable(note)}" for note in study.notes]
-    if remark_lines := [*notes, *_bounds([*fastest, *study.points]), *remarks(study)]:
+    if remark_lines := [*notes, *_explain_bounds([*fastest, *study.points]), *remarks(study)]:
         blocks.append("\n".join(remark_lines))
     if recommended := study.recommendation():
         blocks += ["Recommended settings of the scene:", "\n".join(recommended)]
@@ -191,7 +191,7 @@ def remarks(study: Study) -> Iterator[str]:
     """Yield remarks on a missing step and on the discretisation error of the mesh."""
     mesh, recommended = study.scene_mesh, study.recommended_points
     if recommended is None and study.best_stepping is None:
-        yield _shortfall(study)
+        yield _explain_shortfall(study)
     if mesh is None:
         return
     bound = f"{'' if mesh.known else 'at most about '}{format_number(mesh.error or 0.0)}"
@@ -204,7 +204,7 @@ def remarks(study: Study) -> Iterator[str]:
     points = f"{rows} x {cols}"
     if max(recommended) > MAX_POINTS:
         advice = (
-            f"About {points} would be within it, and a scene may have {MAX_POINTS} a side: take a wider "
+            f"About {points} would be within it, more than the {MAX_POINTS} a side of a scene: take a wider "
             "tool (probes.N.radius, a smaller falloff), or allow a larger error with --tolerance."
         )
     else:
@@ -217,7 +217,7 @@ def remarks(study: Study) -> Iterator[str]:
     )
 
 
-def _shortfall(study: Study) -> str:
+def _explain_shortfall(study: Study) -> str:
     """Return the reason why no step is recommended, and the remedy."""
     closest = _best(study.stepping, study.tolerance)
     if closest is None:
@@ -234,7 +234,7 @@ def _shortfall(study: Study) -> str:
     )
 
 
-def _stepping(study: Study) -> Iterator[str]:
+def _stepping_section(study: Study) -> Iterator[str]:
     yield "## Stepping"
     if (reference := study.reference) is not None:
         extrapolated = ", not extrapolated as contact is of order 1," if study.has_contact else ", extrapolated,"
@@ -248,10 +248,10 @@ def _stepping(study: Study) -> Iterator[str]:
     orders = [f"{method} {order:.2f}" for method, order in study.orders.items() if order is not None]
     if orders:
         yield f"Observed orders: {', '.join(orders)}."
-    yield from _bounds(study.stepping)
+    yield from _explain_bounds(study.stepping)
 
 
-def _meshes(study: Study) -> Iterator[str]:
+def _mesh_section(study: Study) -> Iterator[str]:
     yield "## Points"
     reference = "the finest mesh" if study.has_contact else "the extrapolation, of order 2, of the two finest meshes"
     yield (
@@ -261,10 +261,10 @@ def _meshes(study: Study) -> Iterator[str]:
         "automatic step."
     )
     yield _meshes_table(study)
-    yield from _bounds(study.points)
+    yield from _explain_bounds(study.points)
 
 
-def _bounds(points: Sequence[ErrorMeasurement]) -> Iterator[str]:
+def _explain_bounds(points: Sequence[ErrorMeasurement]) -> Iterator[str]:
     """Yield an explanation of upper bounds, if an error is one."""
     if any(format_error(point).startswith("<") for point in points):
         yield "An error with < is an approximate upper bound, as the reference is not accurate enough."

@@ -45,7 +45,7 @@ class Measurement:
 
     @property
     def seconds(self) -> Timing:
-        """Statistics of the samples, of which there must be one."""
+        """Statistics of the samples; needs at least one."""
         return Timing.of(self.samples)
 
 

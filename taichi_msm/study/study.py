@@ -71,7 +71,7 @@ def run_study(
     try:
         frames = SteppingStudy(plan, device, longest_run, results, partial(progress, "stepping")).run()
         if texture is None:
-            results.notes.append("drawing was left out: the scene names no image")
+            results.notes.append("drawing was not measured: the scene has no image")
         else:
             deformed = max(frames, key=lambda frame: (frame**2).sum(axis=-1).max())
             position = rest_positions(scene.sheet) + deformed
@@ -79,7 +79,7 @@ def run_study(
         MeshStudy(plan, device, longest_run, results, partial(progress, "points")).run()
     except KeyboardInterrupt:
         results.status = "interrupted"
-        results.notes.append("interrupted: the measurements until then")
+        results.notes.append("interrupted; these are the measurements so far")
     results.finish()
     return results
 
@@ -104,6 +104,6 @@ def _require_memory(scene: Scene) -> None:
     if needed > available:
         fault = (
             f"time.duration: a study keeps the trajectories of all frames, {needed / 2**30:.3g} GiB here, but "
-            f"{available / 2**30:.3g} GiB is free; study a shorter time.duration or fewer sheet.points"
+            f"{available / 2**30:.3g} GiB is free; reduce time.duration or sheet.points"
         )
         raise SceneError([fault])

@@ -105,7 +105,7 @@ class Inputs(WorkerPlugin):  # type: ignore[misc]  # that package has no types
 
 
 class Cluster(ClientExecutor):  # type: ignore[misc]
-    """Executor with the workers of a scheduler; of a run, only number, overrides and directory are sent.
+    """Executor on the workers of a scheduler; sends only number, overrides and directory of a run.
 
     Args:
         client: connection to the scheduler.
@@ -179,7 +179,7 @@ def cluster_connection(
         progress: called while waiting for the first worker.
 
     Yields:
-        An executor with the workers.
+        An executor on the workers.
 
     Raises:
         ExecutorError: when no scheduler answers, or a worker cannot execute runs.

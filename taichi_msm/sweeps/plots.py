@@ -471,10 +471,12 @@ def estimate_sensitivity(
     """
     indices = []
     for name, column in results.items():
-        known = np.isfinite(column)
-        if np.count_nonzero(known) >= 64:  # Fewer are too inaccurate to rank parameters.
+        is_finite = np.isfinite(column)
+        if np.count_nonzero(is_finite) >= 64:  # Fewer are too inaccurate to rank parameters.
             indices += [
-                SensitivityIndex(name, parameter.name, *first_order_index(parameter.numbers[known], column[known]))
+                SensitivityIndex(
+                    name, parameter.name, *first_order_index(parameter.numbers[is_finite], column[is_finite])
+                )
                 for parameter in parameters
             ]
     return indices

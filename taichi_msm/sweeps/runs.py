@@ -65,7 +65,7 @@ def _register(sweep: Sweep, directory: Path) -> list[list[Any]]:
     # Values are compared as text: 1 differs from 1.0, and NaN equals itself.
     expected_values = json.dumps(values)
     try:
-        # The limit is for foreign files.
+        # The limit bounds the memory for a foreign file.
         stored = json.loads(read_regular(record, max(1 << 28, 2 * len(expected_values))))
         earlier = {name: stored.get(name) for name in description}
         stored_values, stored_versions = json.dumps(stored["values"]), result_versions(stored["versions"], "cpu")

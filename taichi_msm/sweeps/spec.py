@@ -445,7 +445,7 @@ def _check(data: dict[str, Any], folder: Path) -> tuple[Sweep | None, list[Probl
         problems += _relocate(vary, fixed, folder, path.parent)
         try:
             # A name without folder, as errors of runs must not depend on the current directory.
-            file = scene_file.read_file(_normalised(path), scene_file.SCENE_KIND)._replace(name=path.name)
+            file = scene_file.read_file(_normalise(path), scene_file.SCENE_KIND)._replace(name=path.name)
             problems += _unknown_keys(file, vary, fixed)
         except SceneError as error:
             problems.append(Problem(("scene",), error.lines[0]))
@@ -469,8 +469,8 @@ def _expression_problems(variables: dict[str, Any], fixed: dict[str, Any]) -> li
     return problems
 
 
-def _normalised(path: Path) -> str:
-    """Remove .. from a path, unless the result is another file, by symbolic links."""
+def _normalise(path: Path) -> str:
+    """Remove .. from a path, unless symbolic links make the result another file."""
     short = Path(os.path.normpath(path))
     try:
         return str(short if short.samefile(path) else path)

@@ -47,14 +47,14 @@ class Release(NamedTuple):
 
 
 class Turn(NamedTuple):
-    """The camera orbits as if this distance [px] dragged the near side of the tissue."""
+    """The camera orbits as if the near side of the tissue were dragged by this distance [px]."""
 
     right: float
     down: float
 
 
 class Strength(NamedTuple):
-    """The strength is set [% of the full force or depth]; a negative one lifts gripped tissue."""
+    """The strength is set [% of the full force or depth]; below 0, gripped tissue is lifted."""
 
     percent: float
 

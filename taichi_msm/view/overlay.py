@@ -21,7 +21,7 @@ OUTLINE_GREY = 140
 
 
 class ValueBar(NamedTuple):
-    """Bar of a value; its length is the largest value so far, rounded up."""
+    """Bar of a value; the full bar is the largest value so far, rounded up."""
 
     value: float  # [unit]
     largest: float  # largest value so far, above 0 [unit]

@@ -109,7 +109,7 @@ class Captures:
             text = f"# Recorded in a live session of {printable(self._name)}; `run` repeats it.\n{text}"
             # Besides the keyframes of its probes, a scene has at most 1000 values.
             if len(text.encode()) > MAX_BYTES or count_probe_values(scene) + 1000 > MAX_NODES:
-                raise FilesError("this session is too long for a scene file; reset it, and do less")
+                raise FilesError("this session is too long for a scene file; reset it (r), and record a shorter one")
             (hidden / "session").write_text(text, "utf-8")
             return self._move_to_free_name(hidden / "session", "session", ".yaml")
 
@@ -134,7 +134,7 @@ class Captures:
         return self.saved[-1]
 
     def _copy_picture(self, image: Path) -> Path:
-        """Copy a picture to the folder unless an equal copy is there; return the copy, whose name may be numbered."""
+        """Copy a picture to the folder unless an equal copy is there; return its path."""
         copy, number = self.folder / image.name, 1
         if not image.is_file():
             raise FilesError(f"{image}: missing; put the picture back, the scene needs a copy of it")

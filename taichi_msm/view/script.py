@@ -89,7 +89,7 @@ class Script(Section):
             if entry.do in ("drag", "release") and not presses:
                 raise _refused(n, "{do} when nothing is pressed; put a press or a pull before it", do=entry.do)
             if entry.t < end:
-                message = "begins at {t} s, before the one above ends at {end} s; let them follow each other"
+                message = "begins at {t} s, before the previous event ends at {end} s; take a later t"
                 raise _refused(n, message, t=f"{entry.t:g}", end=f"{end:g}")
             presses, end = entry.do in ("press", "pull") or (presses and entry.do != "release"), entry.t + entry.seconds
         return events
@@ -182,7 +182,7 @@ def record_film(
         session: a new session.
         path: the film, .gif or .mp4.
         seconds: duration of the film [s].
-        events: frame numbers and events, as of `schedule_events`; consumed lazily.
+        events: pairs of a frame number and an event, from `schedule_events`; consumed lazily.
         progress: called for every frame with the finished and the total number; an exception from it stops the session.
         notify: called with every notice of the session.
 

@@ -96,7 +96,7 @@ class Server:
 
     Args:
         session: a new session.
-        listener: socket of `listen`.
+        listener: listening socket, from `listen`.
         title: title of the page.
         origins: permitted origins of pages behind a proxy; origins of the loopback interface are always permitted.
 
@@ -178,7 +178,7 @@ class Server:
         page.send(json.dumps(description))
 
     def disconnect(self, page: _Connection) -> None:
-        """Remove a page; after the page that steers, release the tool: the next page steers."""
+        """Remove a page; if it steered, release the tool and let the next page steer."""
         if page is self.pages[0]:
             self._events.append(events.Release())
         self.pages.remove(page)
@@ -301,7 +301,7 @@ class Pacing:
         return max(0.0, self._next - self._clock())
 
     def due_frames(self) -> Iterator[int]:
-        """Yield once per due frame, counted from 0; stop at `MAX_STEPPING_S`, but not before the first frame."""
+        """Yield the due frames, numbered from 0: the first one, and more ones within `MAX_STEPPING_S`."""
         start = self._clock()
         self._next = max(self._next, start - MAX_DELAY_S)
         count = 0

@@ -35,14 +35,14 @@ from taichi_msm.view.recording import Captures, Film, count_probe_values
 from taichi_msm.view.tools import ForceControlledTool, PositionControlledTool, SheetPosition, clear_start
 from taichi_msm.view.viewport import Viewport
 
-# Largest frame rate of a session, as of common screens [1/s].
+# Largest frame rate of a session, that of a common screen [1/s].
 MAX_FRAME_RATE = 60.0
 
 NOTICE_DURATION_S = 3.0
 
 
 def divide_frames(plan: Plan) -> tuple[Plan, int]:
-    """Divide every frame of a plan into as many subframes as `MAX_FRAME_RATE` permits.
+    """Divide every frame of a plan into the largest number of subframes within `MAX_FRAME_RATE`.
 
     `precision: auto` without a tolerance becomes f32, which takes half the time of f64.
 
@@ -278,8 +278,8 @@ class Session:
         """Draw a picture with a ring at a tool without an instrument; a running film gets it, too."""
         picture = self._draw()
         tool = self.tool
-        hidden = isinstance(tool, PositionControlledTool) or tool.percent == 0 or tool.probe.instrument is not None
-        if not hidden and (pixel := self.viewport.project(self._touched_point())):
+        has_no_ring = isinstance(tool, PositionControlledTool) or tool.percent == 0 or tool.probe.instrument is not None
+        if not has_no_ring and (pixel := self.viewport.project(self._touched_point())):
             overlay.mark_tool(picture, pixel, pulls=self._pulls)
         if self._film is not None:
             try:
@@ -296,7 +296,7 @@ class Session:
 
     @property
     def notice(self) -> str:
-        """Current notice; empty without one. After it, the message of a divergence stays."""
+        """Current notice; without one, the message of a divergence, or empty."""
         return self._notice if self._elapsed < self._notice_until else self.divergence_error
 
     def close(self) -> None:
@@ -434,8 +434,10 @@ class Session:
     def _switch(self) -> None:
         tool = self._position_tool if isinstance(self.tool, ForceControlledTool) else self._force_tool
         if tool is None:
-            needs = "an instrument" if isinstance(self.tool, ForceControlledTool) else "a force"
-            self.show_notice(f"this control of the tool needs {needs}; add it to a probe of the scene")
+            needs = (
+                "position needs an instrument" if isinstance(self.tool, ForceControlledTool) else "force needs a force"
+            )
+            self.show_notice(f"control by {needs}; add it to a probe of the scene")
             return
         try:
             plan = self._with_tool(tool)
@@ -453,7 +455,7 @@ class Session:
         self.show_notice("; ".join(path_warnings(plan.scene, session_tools)))
 
     def _change_material(self, key: str, value: float) -> None:
-        """Change a value of the material, which resets keep."""
+        """Change a value of the material; later resets keep it."""
         initial = self._scene_material.get(key, 0.0)
         # The margin allows for rounding.
         if not initial / MAX_FACTOR * 0.999 <= value <= initial * MAX_FACTOR * 1.001:

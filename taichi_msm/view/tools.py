@@ -22,7 +22,7 @@ from taichi_msm.shapes import SHAPES
 # Time in which the force rises from 0 to full, or the tip moves from its highest to its deepest position [s].
 RISE_TIME_S = 0.2
 
-# Number of last keyframes that affect the next frame, with a jump at its beginning.
+# Number of last keyframes that determine a frame, even with a jump at its beginning.
 ACTIVE_KEYFRAMES = 4
 
 # Height of an idle tip above the sheet at rest [tip radii].
@@ -71,10 +71,10 @@ def _capsule(probe: Probe, sheet: Sheet) -> Tool:
 
 def _hover_height(probe: Probe) -> float:
     assert probe.instrument is not None
-    return _rounded(HOVER_HEIGHT_RADII * probe.instrument.outer_radius)
+    return _round_height(HOVER_HEIGHT_RADII * probe.instrument.outer_radius)
 
 
-def _rounded(height: float) -> float:
+def _round_height(height: float) -> float:
     """Round a height to the nine significant digits of a scene file."""
     return float(f"{height:.9g}")
 
@@ -213,7 +213,7 @@ MAX_DEPTH_RADII = 5.0
 # Coefficient of Coulomb friction of probes without one.
 DEFAULT_FRICTION = 0.5
 
-# Interval of a grip before the start [s]: has no effect, but makes the kernel compile grips.
+# Interval of a grip before the start [s], which has no effect; with it, the kernel is compiled with grips.
 NO_GRIP = (-2.0, -1.0)
 
 
@@ -324,10 +324,10 @@ class PositionControlledTool:
 
     @property
     def _target_height(self) -> float:
-        return _rounded(0.0 - self.depth) if self.engaged else self._hover_height
+        return _round_height(0.0 - self.depth) if self.engaged else self._hover_height
 
     def _move_tip(self) -> None:
-        """Move the tip towards its target, by at most the longest way of a frame."""
+        """Move the tip towards its target, by at most the distance that a frame permits."""
         max_rise = (HOVER_HEIGHT_RADII * self._radius + self._max_depth) / (RISE_TIME_S * self.grid.frames_per_second)
         rise = self._target_height - self.height
         goal = self._target_height if abs(rise) <= max_rise else self.height + math.copysign(max_rise, rise)
@@ -338,9 +338,9 @@ class PositionControlledTool:
         fraction = min(1.0, max_distance / distance) if distance > 0 else 1.0
         if fraction < 1:
             self.position = on_sheet((across + fraction * (to_across - across), down + fraction * (to_down - down)))
-            self.height = _rounded(self.height + fraction * (goal - self.height))
+            self.height = _round_height(self.height + fraction * (goal - self.height))
         else:
-            self.position, self.height = self.target, _rounded(goal)
+            self.position, self.height = self.target, _round_height(goal)
 
     def _time(self, frame: int) -> float:
         """Return the time of a frame [s], bit-identical to its step, so that the tip is exactly at the keyframe."""
