@@ -53,11 +53,11 @@ def sweep(
     loaded = load_sweep(file)
     directory = common.result_directory(out, Path(file).stem)
     cost = estimate_cost(loaded)
-    worker_count = choose_worker_count(cost, loaded.runs, workers)
     if dry_run:
         _print_dry_run(loaded, cost, shard or (1, 1), workers, as_json)
         return common.DONE
     if not yes and (loaded.runs > MAX_UNCONFIRMED_RUNS or cost.seconds > 86400):
+        worker_count = choose_worker_count(cost, loaded.runs, workers)
         raise click.UsageError(f"{cost_line(loaded.runs, cost, worker_count)}; add --yes to start them")
     state = begin_sweep(loaded, directory, shard or (1, 1))
     outcomes, missing = state.outcomes, len(state.missing)

@@ -31,13 +31,7 @@ from taichi_msm.scene.scene import Scene
 from taichi_msm.scene.section import MAX_POINTS
 from taichi_msm.solver.dynamics import Dynamics
 from taichi_msm.solver.planning import plan_variant, stable_steps, try_plan, with_time
-from taichi_msm.study.result import (
-    DrawingMeasurement,
-    MeshMeasurement,
-    Reference,
-    SteppingMeasurement,
-    Study,
-)
+from taichi_msm.study.result import DrawingMeasurement, MeshMeasurement, Reference, SteppingMeasurement, Study
 from taichi_msm.system import process
 from taichi_msm.system.runtime import Device
 

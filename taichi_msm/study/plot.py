@@ -45,24 +45,10 @@ PRECISION_LINES: dict[str, dict[str, Any]] = {
     "f64": {"linestyle": (0, (3.5, 1.8)), "marker": "s"},
 }
 TOLERANCE_LINE: dict[str, Any] = {"color": GREY, "linewidth": 0.8, "linestyle": (0, (6, 3))}
-RECOMMENDED_MARKER: dict[str, Any] = {
-    "ls": "none",
-    "marker": "o",
-    "ms": 11,
-    "mfc": "none",
-    "mec": INK,
-    "zorder": 5,
-}
+RECOMMENDED_MARKER: dict[str, Any] = {"ls": "none", "marker": "o", "ms": 11, "mfc": "none", "mec": INK, "zorder": 5}
 BOUND_MARKER: dict[str, Any] = {"mfc": "white"}
 LEGEND_MARKER: dict[str, Any] = {"linestyle": "none", "marker": "o", "color": GREY}
-SUPERSAMPLE_COLOURS = (
-    SKY,
-    BLUE,
-    GREEN,
-    ORANGE,
-    PURPLE,
-    VERMILION,
-)
+SUPERSAMPLE_COLOURS = (SKY, BLUE, GREEN, ORANGE, PURPLE, VERMILION)
 MARKERS = "osD^vPX"
 
 # Mosaic by the number of panels.
@@ -108,9 +94,9 @@ def _figure(study: Study) -> Figure:
     )
     figure = Figure(figsize=size, dpi=DPI, layout=ConstrainedLayoutEngine(w_pad=0.1, h_pad=0.1, wspace=0.05))
     FigureCanvasAgg(figure)
-    versions = study.machine["versions"]
     state = " (interrupted)" if study.status == "interrupted" else ""
     figure.suptitle(f"{printable(study.scene)}: speed against error{state}", x=0.01, ha="left", parse_math=False)
+    versions = study.machine["versions"]
     machine = f"{machine_summary(study)}; taichi-msm {versions['taichi-msm']}, {compiler_label(versions)}"
     figure.supxlabel(
         f"{_recommendation_line(study)}\n{machine}", x=0.01, ha="left", size=8, parse_math=False, wrap=True

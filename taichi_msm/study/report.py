@@ -23,13 +23,7 @@ from taichi_msm.study.format import (
     format_timing,
     machine_summary,
 )
-from taichi_msm.study.result import (
-    DrawingMeasurement,
-    Measurement,
-    Reference,
-    SteppingMeasurement,
-    Study,
-)
+from taichi_msm.study.result import DrawingMeasurement, Measurement, Reference, SteppingMeasurement, Study
 from taichi_msm.system.compiler import compiler_label
 
 PICTURE_FILE, PAGE_FILE, RECORD_FILE = "study.png", "study.md", "study.json"

@@ -500,7 +500,7 @@ def first_order_index(parameter: NDArray[np.float64], result: NDArray[np.float64
     for shuffle in range(8):
         shuffled = random.permutation(len(result))
         ranks = np.argsort(np.argsort(parameter[shuffled], kind="stable"), kind="stable")
-        # Four successive ranks keep their random order.
+        # Groups of four successive ranks keep their random order.
         ordered = result[shuffled][np.argsort(ranks // 4, kind="stable")]
         positions = np.arange(len(result), dtype=np.float64)[:, np.newaxis]
         analysis = rbd_fast.analyze(problem, positions, ordered, M=4, num_resamples=25, seed=1 + shuffle)

@@ -17,7 +17,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from taichi_msm.errors import SceneError, StageProgressCallback, writing
+from taichi_msm.errors import SceneError, StageProgressCallback
 from taichi_msm.load import cost
 from taichi_msm.load.scene_file import plan_file
 from taichi_msm.model.plan import Plan
@@ -48,9 +48,6 @@ def write_reports(
 
     Returns:
         Names of the written files; and warnings, such as the failure of a report other than the table.
-
-    Raises:
-        FilesError: when the table cannot be written.
     """
     writers: dict[str, Callable[[SweepState, list[str]], list[str]]] = {
         "table.parquet": write_parquet,
@@ -59,17 +56,16 @@ def write_reports(
         "sweep.png": _write_plots,
     }
     written, notes = ["table.csv"], list[str]()
-    with writing(state.directory):
-        write_table(state)
-        for name, write in writers.items():
-            try:
-                notes += write(state, written)
-            except Exception as error:
-                # A failing report must not discard hours of runs.
-                notes.append(f"{name} could not be written: {type(error).__name__}: {error}")
-        for path in (state.directory / name for name in REPORT_FILES if name not in written):
-            if not path.is_dir():
-                path.unlink(missing_ok=True)
+    write_table(state)
+    for name, write in writers.items():
+        try:
+            notes += write(state, written)
+        except Exception as error:
+            # A failing report must not discard hours of runs.
+            notes.append(f"{name} could not be written: {type(error).__name__}: {error}")
+    for path in (state.directory / name for name in REPORT_FILES if name not in written):
+        if not path.is_dir():
+            path.unlink(missing_ok=True)
     return written, notes
 
 

@@ -278,8 +278,8 @@ class Session:
         """Draw a picture with a ring at a tool without an instrument; a running film gets it, too."""
         picture = self._draw()
         tool = self.tool
-        has_no_ring = isinstance(tool, PositionControlledTool) or tool.percent == 0 or tool.probe.instrument is not None
-        if not has_no_ring and (pixel := self.viewport.project(self._touched_point())):
+        has_ring = isinstance(tool, ForceControlledTool) and tool.percent != 0 and tool.probe.instrument is None
+        if has_ring and (pixel := self.viewport.project(self._touched_point())):
             overlay.mark_tool(picture, pixel, pulls=self._pulls)
         if self._film is not None:
             try:
@@ -432,11 +432,10 @@ class Session:
         return plan
 
     def _switch(self) -> None:
-        tool = self._position_tool if isinstance(self.tool, ForceControlledTool) else self._force_tool
+        by_force = isinstance(self.tool, ForceControlledTool)
+        tool = self._position_tool if by_force else self._force_tool
         if tool is None:
-            needs = (
-                "position needs an instrument" if isinstance(self.tool, ForceControlledTool) else "force needs a force"
-            )
+            needs = "position needs an instrument" if by_force else "force needs a force"
             self.show_notice(f"control by {needs}; add it to a probe of the scene")
             return
         try:
