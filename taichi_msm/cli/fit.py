@@ -16,9 +16,7 @@ from taichi_msm.errors import DivergedError, printable
 @click.argument("observed", metavar="OBSERVED")
 @click.argument("more", metavar="", nargs=-1)
 @click.option("--free", metavar="KEY ...", multiple=True, help="Parameters to fit: keys of the scene, by dotted path.")
-@click.option(
-    "--bounds", metavar="KEY=LOW,HIGH ...", multiple=True, help="Smallest and largest value of a fitted parameter."
-)
+@click.option("--bounds", metavar="KEY=LOW,HIGH ...", multiple=True, help="Smallest and largest value of a parameter.")
 @options.set_option
 @click.option(
     "--forces",
@@ -33,24 +31,19 @@ from taichi_msm.errors import DivergedError, printable
 @click.option("--drift", type=float, metavar="SECONDS", help="Correlation time of the errors of a track [s].")
 @click.option("--profile", is_flag=True, help="Compute intervals by profile likelihood; takes more runs.")
 @click.option("--resolution", type=int, metavar="R", help="Cells along a side of a fitted map.")
-@click.option(
-    "--columns", metavar="NAME=COLUMN", multiple=True, help='Of tables: column of a quantity, as "depth=Traverse, mm".'
-)
+@click.option("--columns", metavar="NAME=COLUMN", multiple=True, help='Of tables: a column, as "depth=Traverse, mm".')
 @click.option("--sheet", metavar="SHEET", help="Of tables: sheet of a workbook.")
 @click.option("--block", type=int, metavar="N", help="Of tables: block of rows in a file, from 1.")
 @click.option("--window", metavar="T0,T1", help="Of tables: first and last time to use [s].")
 @click.option(
-    "--rate",
-    type=float,
-    metavar="RATE",
-    help="Of tables: frames per second of the fit.  [default: 10, for at most 200 frames]",
+    "--rate", type=float, metavar="RATE", help="Of tables: frame rate [1/s].  [default: 10, less above 200 frames]"
 )
 @click.option(
     "--contact",
     type=float,
     metavar="DEPTH",
     multiple=True,
-    help="Of tables: depth at contact [m], for all tables or each of them.",
+    help="Of tables: depth at contact [m], one for all or each.",
 )
 @click.option("--out", metavar="DIR", help="Directory for the fit.  [default: output/<name of the scene file>-fit]")
 @options.workers_option(help="Number of worker processes.  [default: chosen by the duration of the first run]")

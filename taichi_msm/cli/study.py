@@ -125,7 +125,7 @@ def view(
     if seconds is not None and record is None:
         raise click.UsageError("--seconds N needs --record FILE")
     if script is not None and seconds is None:
-        raise click.UsageError("--script needs --record FILE and --seconds N; on a page, the mouse replaces it")
+        raise click.UsageError("--script needs --record FILE and --seconds N: a script drives a film without a page")
     if (port or origins) and seconds is not None:
         raise click.UsageError("--seconds films without a page; leave out either --seconds, or --port and --origin")
     if seconds is not None and math.isnan(seconds):

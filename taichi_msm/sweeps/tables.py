@@ -114,7 +114,7 @@ def write_parquet(state: SweepState, written: list[str]) -> list[str]:
         written: names of the written reports; table.parquet is appended.
 
     Returns:
-        An empty list; reports return their warnings.
+        No warnings.
     """
     try:
         import pyarrow
@@ -165,7 +165,7 @@ def write_dataset(state: SweepState, written: list[str]) -> list[str]:
         written: names of the written reports; dataset.json is appended.
 
     Returns:
-        An empty list; reports return their warnings.
+        No warnings.
     """
     sweep, complete = state.sweep, [outcome.run for outcome in state.outcomes if outcome.status == "complete"]
     common = _output_format(state.run_directory(complete[0])) if complete else {}
