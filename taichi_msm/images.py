@@ -27,7 +27,7 @@ _MODES = ("1", "L", "LA", "P", "PA", "RGB", "RGBA", "RGBa", "RGBX", "CMYK", "YCb
 # Largest side [px]. Pillow spends memory and time on every row, even of a single column.
 MAX_SIDE_PX = 65535
 
-# Largest file [bytes], above that of Pillow's largest picture, of four channels of 16 bits.
+# Largest file [bytes], larger than Pillow's largest picture with four channels of 16 bits.
 MAX_BYTES = 2**31
 
 # Path of the copy that is read in place of a file, by path of the file.
@@ -145,8 +145,8 @@ def _open(path: str, sha256: str | None = None) -> Iterator[Image.Image]:
                     raise PictureError(f"{path} {reason}")
                 if image.format in ("JPEG", "MPO"):
                     scans = _count_scans(file)
-                    # A scan is a pass over the picture. Encoders write about ten of them; more may have 200 million
-                    # pixels in all, which take a few seconds to decode.
+                    # A scan is a pass over the picture, and encoders write about ten. More are allowed up to 200
+                    # million pixels in all, which take a few seconds.
                     limit = max(16, 200_000_000 // (image.width * image.height))
                     if scans > limit:
                         raise PictureError(f"{path} has {scans} scans, more than {limit}; save it again")

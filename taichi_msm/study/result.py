@@ -104,7 +104,7 @@ class Study:
     status: str  # complete or interrupted
     tolerance: float  # largest allowed error, as a fraction of the largest displacement
     machine: dict[str, Any]  # CPU, cores, arch, threads, bits of a vector, and versions
-    reference: Reference | None = None  # None if the study was interrupted before
+    reference: Reference | None = None  # None if the study was interrupted before it
     stepping: list[SteppingMeasurement] = field(default_factory=list)  # by method, with decreasing steps
     orders: dict[str, float | None] = field(default_factory=dict)  # order of convergence by method
     drawing: list[DrawingMeasurement] = field(default_factory=list)  # by supersampling and refinement

@@ -48,7 +48,7 @@ def write_text(
         above: lines in the upper left corner, above the bar and the two columns of the table.
         below: text at the bottom, wrapped to the width.
         table: text of two columns, such as keys and their effects; None for no table.
-        bar: None for no bar.
+        bar: bar between the lines and the table; None for no bar.
     """
     height, width = picture.shape[:2]
     # Height of letters [px].

@@ -63,7 +63,7 @@ MAX_EVENTS = 500
 # Shortest wait for events between two pictures [s].
 MIN_WAIT_S = 0.001
 
-# Longest delay behind real time that the session makes up for [s].
+# Longest delay behind real time that the session catches up [s].
 MAX_DELAY_S = 0.1
 
 # Longest time of stepping between two pictures, even if more frames are due [s].
@@ -301,7 +301,7 @@ class Pacing:
         return max(0.0, self._next - self._clock())
 
     def due_frames(self) -> Iterator[int]:
-        """Yield the due frames, numbered from 0: the first one, and more ones within `MAX_STEPPING_S`."""
+        """Yield the due frames, numbered from 0: the first one, and others within `MAX_STEPPING_S`."""
         start = self._clock()
         self._next = max(self._next, start - MAX_DELAY_S)
         count = 0
