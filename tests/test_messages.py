@@ -157,7 +157,7 @@ NOT_PROVOKED = {
     "model_rejected correlation residual residual_force sigma sigma_force unit chi_square",
     "not a flow of",
     "pieces), so pictures and labels would be wrong; take --arch cpu",
-    "runs have ended before",
+    "runs are finished already",
     "s is too long for a factor of",
     "s or less, or auto",
     "sheet.points: too few to take half of them",

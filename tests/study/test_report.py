@@ -68,7 +68,7 @@ def realistic() -> Study:
     for supersample, refine in product((1, 2, 4), (0, 1, 2, 5)):
         psnr, samples = 50 + 5 * supersample - 4 / (1 + refine) ** 4, spread(0.01 * supersample**2)
         study.drawing.append(DrawingMeasurement(refine, supersample, psnr, 12 - refine, samples=samples))
-    study.notes = ["drawing was not measured from refine 10, supersample 4 on: memory"]
+    study.notes = ["drawing was not measured from refine 10, supersample 4 on, for lack of memory"]
     return study
 
 

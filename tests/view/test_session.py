@@ -477,8 +477,8 @@ def test_scenes_without_a_session(
 
 
 def test_units_of_lengths_and_forces(message: Messages) -> None:
-    message(map(live_session.length, (0.0, 1.33e-7, 1.67e-6, 1e-5, 8.284e-4, 0.0621, 12.3)))
-    message(map(live_session.newtons, (0.0, 0.514, 9.63, 123.4)))
+    message(map(live_session.format_length, (0.0, 1.33e-7, 1.67e-6, 1e-5, 8.284e-4, 0.0621, 12.3)))
+    message(map(live_session.format_force, (0.0, 0.514, 9.63, 123.4)))
 
 
 def instrument_pixels(session: Session) -> set[tuple[int, int]]:
@@ -626,14 +626,14 @@ def test_force_is_shown_with_a_bar(begin: Begin, message: Messages) -> None:
         session.handle(Strength(percent))
         advance(session, 20)
         largest = max(largest, session.felt_force())
-    (figures, *_) = session._figure_lines()
-    assert figures.endswith(live_session.newtons(session.felt_force()))
-    message(figures, "45 mm", hide=r"[\d.]+ N")
+    (readings, *_) = session._reading_lines()
+    assert readings.endswith(live_session.format_force(session.felt_force()))
+    message(readings, "45 mm", hide=r"[\d.]+ N")
     bar = overlay.ValueBar(session.felt_force(), largest, "N")
     assert bar_of(session.picture()) == pytest.approx(session.felt_force() / bar.end, abs=0.02)
     session.handle(Key("r"))
     session.handle(Strength(40))
-    message(session._figure_lines()[0], "30 mm", "0 N")
+    message(session._reading_lines()[0], "30 mm", "0 N")
     assert (session.picture()[40:70, :130] == bare[40:70, :130]).all(), "without a force there is no bar"
 
 
