@@ -124,7 +124,8 @@ def run_summary(record: Mapping[str, Any], directory: Path) -> str:
         Text for the terminal.
     """
     times, (rows, cols) = record["timings"], record["points"]
-    stages = ", ".join(f"{stage} {seconds:.2f}" for stage, seconds in times.items() if stage != "total")
+    named = {"companion runs" if stage == "pilot" else stage: seconds for stage, seconds in times.items()}
+    stages = ", ".join(f"{stage} {seconds:.2f}" for stage, seconds in named.items() if stage != "total")
     parallel = times["encode"] > 0 and record["threads"] > 1
     steps = (
         f"at rest to {record['residual']:.1g} of the largest force, {record['evaluations']} evaluations of the forces"

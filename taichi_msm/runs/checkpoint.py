@@ -204,9 +204,8 @@ class Checkpoint:
         self._plan, self._state_path, self._frames_path = plan, folder / STATE_FILE, folder / FRAMES_FILE
         self._next_save, self._manifest = 0.0, b""
         self._file: BinaryIO | None = None  # None without outputs: the frames are not needed
-        self._force_count = len(scene.probes) if scene.asks_for("forces") else 0
         position = "position", self.precision, (*scene.sheet.points, 3)
-        forces = "forces", np.float64, (self._force_count, FORCE_COLUMNS)
+        forces = "forces", np.float64, (len(scene.probes), FORCE_COLUMNS)
         self._frame_dtype = np.dtype([("checksum", np.int64), position, forces])
 
     @property
@@ -253,10 +252,10 @@ class Checkpoint:
 
         Args:
             position: positions of the mass points [m], shape (rows, cols, 3).
-            forces: force of every probe; stored only for scenes that output forces.
+            forces: force of every probe.
         """
         if self._file:
-            parts = np.ascontiguousarray(position, self.precision), _tip_force_array(forces)[: self._force_count]
+            parts = np.ascontiguousarray(position, self.precision), _tip_force_array(forces)
             self._file.seek(self.frames * self._frame_dtype.itemsize)
             for part in (np.array(self._checksum(self.frames, *parts)), *parts):
                 remaining = part.reshape(-1).view(np.uint8).data
@@ -269,7 +268,7 @@ class Checkpoint:
         return self._read(frame)[0]
 
     def read_forces(self, frame: int) -> tuple[TipForce, ...]:
-        """Read the force of every probe in a frame; only for scenes that output forces."""
+        """Read the force of every probe in a frame."""
         return _tip_forces(self._read(frame)[1])
 
     def save(self, saved: Snapshot) -> str:

@@ -329,10 +329,9 @@ class _Run:
             self._path_dependence.check_frame(frame, displacement)
         if self._error_estimator and frame > 0:
             with self._stopwatch.stage("pilot"):
-                forces = None  # unknown before the resumption
-                if frame >= self._resumed_frames:
-                    by_probe = self._simulation.forces()
-                    forces = np.array([by_probe[tool.probe].force for tool in self._context.plan.tools]).reshape(-1, 3)
+                is_stored = frame < self._resumed_frames
+                by_probe = self._writer.read_forces(frame) if is_stored else self._simulation.forces()
+                forces = np.array([by_probe[tool.probe].force for tool in self._context.plan.tools]).reshape(-1, 3)
                 self._error_estimator.compare_frame(displacement, pause, forces)
 
     def _refine_estimate(self) -> None:

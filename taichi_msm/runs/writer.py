@@ -108,6 +108,11 @@ class ResultWriter:
         with writing(self._directory):
             return self._checkpoint.read_positions(frame)
 
+    def read_forces(self, frame: int) -> tuple[TipForce, ...]:
+        """Read the force of every probe in a stored frame."""
+        with writing(self._directory):
+            return self._checkpoint.read_forces(frame)
+
     def add(
         self, position: NDArray[Any], observed: Mapping[str, FrameOutputs], forces: Sequence[TipForce] = ()
     ) -> None:

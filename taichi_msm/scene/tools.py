@@ -245,9 +245,10 @@ class Probe(Section):
                 if getattr(self, name):
                     raise scene_fault(f"requires path; remove {name} from a tool with a force", name)
             return self
-        for name in sorted(_FORCE_KEYS & given):
-            if getattr(self, name) is not None:
-                raise scene_fault("requires a force, and path replaces it; remove one of them", name)
+        names = [name for name in sorted(_FORCE_KEYS & given) if getattr(self, name) is not None]
+        if names:
+            them = f"them: {', '.join(names)}" if len(names) > 1 else "one of them"
+            raise scene_fault(f"requires a force, and path replaces it; remove {them}", names[0])
         if self.instrument is None:
             raise scene_fault("missing; with path expected a mapping with radius, shaft and length", "instrument")
         return self
