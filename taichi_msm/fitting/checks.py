@@ -45,8 +45,8 @@ def faults_at_start(
         observations: the observations.
         scene: the initial scene.
         first: prediction of the whole initial scene.
-        parameters: parameters of the fit; a free camera disables checks of the camera, a linear parameter checks of
-            signs.
+        parameters: parameters of the fit. A free camera skips the check of the camera; a linear parameter, which may
+            change sign, skips that of signs.
     """
     rate, motion, name = scene.time.frames_per_second, float(first.motion.max()), observations[0].name
     if motion <= ROUNDING_SHARE * max(scene.sheet.size):

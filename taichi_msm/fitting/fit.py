@@ -60,21 +60,21 @@ def fit(
             NaN where not observed; optionally `sigma`, the standard deviation of their errors. Or a run's
             trajectory.npz or tracks.npz. Or one or more tables of a testing machine, .csv, .tsv, .txt or .xlsx, with
             time, depth and force, which the scene's only position-controlled tool follows.
-        free: keys of the parameters, as dotted paths such as tissue.young or probes.0.total.2; or tissue.map, a map
-            of R x R cells, alone or with a component of a force, which scales all forces by a common factor. With
-            tables also contact, or contact.0, ... for several: the depth of contact, as in the table [m].
-        bounds: smallest and largest values by key; for tissue.map, of the factors.
+        free: keys of the parameters, dotted paths such as tissue.young or probes.0.total.2. tissue.map is a map of
+            R x R cells; one component of a force may be free with it, whose factor then scales all forces. contact, or
+            contact.0, ... of several tables, is the depth of contact [m of the table].
+        bounds: smallest and largest value of a parameter, by key; of tissue.map those of its factors.
         forces: a forces.csv of the same motion, and the standard deviation of its forces [N].
         directory: directory for fit.json, scene.yaml, fit.png and a map's pictures; by default none is written.
         workers: number of worker processes; by default chosen by the duration of the first run.
-        progress: called often with the stage, the finished and the expected number of runs; an exception from it ends
-            the fit, and nothing is written.
-        **method: options. For observed points, sigma: standard deviation instead of the file's; robust: whether to
-            downweight outliers; profile: whether to compute profile intervals; correlation: correlation length of the
-            errors of tracks [px]; drift: correlation time of the errors of a track [s]; resolution: R of a map. For
-            tables, columns: selected columns, such as ["depth=Traverse, mm"]; sheet, block: selected
-            sheet and block of a file; window: first and last time [s]; rate: frames per second; contact: depths of
-            contact, as in the tables [m], one for all or one per table.
+        progress: callback for the stage, the number of finished runs and the expected number; an exception from it
+            ends the fit without files.
+        **method: options. Of all fits of numbers: `robust` (lower weight of outliers), `profile` (profile-likelihood
+            intervals). Of points: `sigma` (standard deviation of the errors, replaces that of the file), `correlation`
+            (correlation length of the errors of tracks [px]), `drift` (correlation time of the errors of a track [s]),
+            `resolution` (R of a map). Of tables: `columns` (selected columns, such as ["depth=Traverse, mm"]), `sheet`
+            and `block` of a file, `window` (first and last time [s]), `rate` (frames per second), `contact` (depths of
+            contact [m of the table], one for all tables or one each).
 
     Returns:
         The estimates; `identifiable` is False if the data do not determine a parameter.
@@ -134,7 +134,7 @@ def _read_problem(
     forces: tuple[str | Path, float] | None,
     method: Method,
 ) -> tuple[FitProblem, MapSettings | None]:
-    """Read and check observations of points and forces; return the fit, and the settings of a map or None."""
+    """Return the problem of a fit to points and forces, and the settings of its map, None for a fit of numbers."""
     points = read_observations(observed, initial.time.frames_per_second).with_sigma(method.get("sigma"))
     observations: tuple[Observation, ...] = (points,)
     if unused := [name for name in TABLE_OPTIONS if method.get(name)]:
@@ -170,7 +170,7 @@ def _fit(runs: Runs, scene: Scene, method: Method) -> FitResult:
     if machine is None:
         problems += faults_at_start(observations, scene, first, parameters)
     if not any(probe.moved for probe in scene.probes):
-        # The forces of force-controlled tools do not depend on the tissue.
+        # Without position-controlled tools no tissue changes the forces, so a wrong unit is certain before the search.
         problems += unit_faults(observations, first)
     if problems:
         raise SceneError(problems)
@@ -191,7 +191,7 @@ def _fit(runs: Runs, scene: Scene, method: Method) -> FitResult:
     if isinstance(runs, CurveRuns):
         runs.by_tangent = False
     profiles = Profiler(runs, misfit, solution, uncertainties).profiles() if method.get("profile") else None
-    mesh, shifts = _mesh(runs, misfit, solution, uncertainties)
+    mesh_error, shifts = _mesh_effect(runs, misfit, solution, uncertainties)
     estimates = {
         parameter.key: _estimate(parameter, float(solution.x[n]), n, uncertainties, profiles, shifts)
         for n, parameter in enumerate(parameters)
@@ -226,7 +226,7 @@ def _fit(runs: Runs, scene: Scene, method: Method) -> FitResult:
         degrees_of_freedom=uncertainties.freedom,
         identifiable=all(estimate.identifiable for estimate in estimates.values()),
         unseen=unidentified,
-        mesh_error=mesh,
+        mesh_error=mesh_error,
         runs=runs.count,
         notes=notes,
         scene=Scene(**runs.problem.fitted_data(as_data(scene), values)),
@@ -298,7 +298,7 @@ def _rejection(
 
 
 def _larger_part(observations: Sequence[Observation], parts: Sequence[Array], predictions: Sequence[Array]) -> str:
-    """Describe the observation with the largest residuals [sigma], and a common factor of its values."""
+    """Name the observation with the largest residuals [sigma], and the ratio to its prediction; "" if all are alike."""
     squares = [float(np.mean(part**2)) for part in parts]
     if len(parts) == 1 or max(squares) < 2.0 * min(squares):
         return ""
@@ -306,13 +306,13 @@ def _larger_part(observations: Sequence[Observation], parts: Sequence[Array], pr
     return f", mostly of the {observations[largest].noun}{observations[largest].factor_note(predictions[largest])}"
 
 
-def _mesh(
+def _mesh_effect(
     runs: Runs, misfit: Misfit, solution: Solution, uncertainties: Uncertainty
 ) -> tuple[float | None, Array | None]:
-    """Return the mesh error, and the resulting shifts of the parameters in units of x, NaN if unknown.
+    """Return the mesh error, and the shift of x that it causes, shape (n,), NaN if unknown; None without coarse meshes.
 
-    Shifts are extrapolated with the order of convergence on three meshes, limited by the expected order. A shift that
-    is small by chance on the finer meshes is replaced by the expectation from the coarser ones.
+    Richardson extrapolation, with the order of convergence of three meshes, at most the expected order. The two finer
+    meshes may agree by chance: a shift is at least the coarser one, reduced by the expected order.
     """
     error = runs.mesh_error(solution.x)
     if error is None or (half_mesh := runs.predict_coarse(solution.x, 1)) is None:

@@ -1,17 +1,18 @@
-"""Fast approximation of quasi-static machine tests: one curve of elastic force over travel, relaxed in time.
+"""Fast fit of quasi-static machine tests by a force curve, the elastic force over the travel of the tool.
 
-As all elastic forces relax alike, the equilibrium of the tissue depends only on the travel of the tool. The elastic
-force f over the travel is computed at a few travels, and interpolated. The force of a test at frame n is
+All elastic forces relax alike, so the equilibrium of the tissue depends only on the travel. One run gives the elastic
+force f at `TRAVELS` travels, and interpolation between them the force of any test at frame n,
 
-    F_n = (1 - G) f_n + sum of (s_i + share_i phi_i f_n)
+    F_n = (1 - G) f_n + sum over i of (s_i + share_i phi_i f_n)
 
-with shares, phi and memory s_i as in `terms/viscoelasticity.py`. Depths of contact, shares and times need no further
-curve. In the other parameters, log f is linearised: in their logarithms, and in the reciprocal of a lock, with one more
-curve per parameter. This tangent is minimised within a trust region, and a curve is computed at its minimum, until the
-cost does not improve.
+with G, share_i, phi_i and memory s_i as in `terms/viscoelasticity.py`.
 
-Curves neglect the memory of mass points that leave the tool or slide along it. Therefore the tests are finally run, and
-their difference from the tangent is added to it. The Jacobian is that of the tangent.
+- Depths of contact, shares and times change F_n, but not the curve.
+- Other parameters change the curve. Its tangent is linear: log f over the log of each parameter, or over the reciprocal
+  of a lock, from one more curve per parameter. The search minimises the cost of the tangent within a trust region,
+  computes the curve at the minimum, and repeats both until the cost stops falling.
+- A curve neglects the memory of mass points that leave the tool or slide along it. The last steps of the search
+  therefore run the tests, and add the error of the tangent to it. The Jacobian is that of the tangent.
 """
 
 from __future__ import annotations
@@ -32,10 +33,10 @@ from taichi_msm.load.check import check_scene
 from taichi_msm.model.plan import Plan
 from taichi_msm.scene.scene import Scene
 
-# Number of travels of a curve above 0, and margin beyond the greatest travel if depths of contact are free, as a share.
+# Number of travels of a curve above 0; extension of the curve for free depths of contact [share of its reach].
 TRAVELS, CONTACT_MARGIN = 24, 0.05
 
-# Share of every branch in the run of a curve: the tissue does not relax, but the compiled kernels are those of tests.
+# Share of every branch in the run of a curve: no relaxation, but the compiled kernels of the tests.
 NO_SHARE = 1e-12
 
 # Largest sum of the shares in a prediction.
@@ -43,7 +44,7 @@ MAX_SHARES = 0.999
 
 
 def has_curve(problem: object) -> bool:
-    """Return whether a fit is of quasi-static machine tests, with a single tool that does not grip."""
+    """Return whether a force curve applies: quasi-static machine tests, with a single tool that does not grip."""
     if not isinstance(problem, MachineProblem):
         return False
     return problem.scene.time.at_rest and len(problem.scene.probes) == 1 and not problem.scene.probes[0].grip
@@ -79,7 +80,7 @@ class _Tangent(NamedTuple):
 
 
 class CurveRuns(Runs):
-    """Predictions of machine tests by curves, or by their tangent, with a correction at every frame.
+    """Predictions of machine tests by curves or by a tangent, both plus one correction of every frame.
 
     Args:
         problem: the fit.
@@ -87,9 +88,8 @@ class CurveRuns(Runs):
         progress: progress callback, as for `Runs`.
 
     Attributes:
-        by_tangent: whether to predict by the tangent, or by curves.
-        is_of_curve: mask of the parameters that a curve depends on, shape (n,).
-        is_contact: mask of the depths of contact, shape (n,).
+        by_tangent: whether `predict_one` uses the tangent; otherwise it computes a curve.
+        changes_curve: mask of the parameters that change the curve, shape (n,).
     """
 
     problem: MachineProblem
@@ -102,8 +102,8 @@ class CurveRuns(Runs):
         self._correction: Array | float = 0.0
         self.by_tangent = True
         keys = [parameter.key for parameter in self.problem.parameters]
-        self.is_of_curve = np.array([not key.startswith(("contact", "tissue.relaxation.")) for key in keys])
-        self.is_contact = np.array([key.startswith("contact") for key in keys])
+        self.changes_curve = np.array([not key.startswith(("contact", "tissue.relaxation.")) for key in keys])
+        self._is_contact = np.array([key.startswith("contact") for key in keys])
         self._is_lock = np.array([key.endswith(".lock") for key in keys])
 
     def first(self, x: Array) -> Prediction:
@@ -129,7 +129,7 @@ class CurveRuns(Runs):
             return None
 
     def mesh_error(self, x: Array) -> float | None:
-        # The run of a curve stands for those of the tests.
+        # The run of the curve has the mesh error of the tests.
         values = self._predictor.values(x)
         return mesh_error(self._plan_curve(values, self._reach(values)), self._report_progress)
 
@@ -150,11 +150,11 @@ class CurveRuns(Runs):
         return self._predictor.predict(x, pause=self._report_progress)
 
     def correct(self, x: Array, predicted: Prediction) -> None:
-        """Correct all further predictions by the error of the tangent at x.
+        """Add the error of the tangent at x to all further predictions.
 
         Args:
             x: coordinates of the parameters, shape (n,).
-            predicted: exact prediction at x.
+            predicted: prediction at x by a curve, or by runs of the tests.
         """
         if (by_tangent := self.predict_one(x)) is not None:
             self._correction = self._correction + predicted.values[0] - by_tangent.values[0]
@@ -177,7 +177,7 @@ class CurveRuns(Runs):
         values = self._predictor.values(x)
         reach = self._reach(values)
         forces, slopes = self._forces(values, reach), np.zeros((len(x), TRAVELS + 1))
-        for n in np.flatnonzero(self.is_of_curve):
+        for n in np.flatnonzero(self.changes_curve):
             shifted, delta = x.copy(), difference_step(self.problem.scene)
             delta = delta if x[n] + delta <= self.problem.parameters[n].limits[1] else -delta
             shifted[n] += delta
@@ -186,16 +186,25 @@ class CurveRuns(Runs):
             slopes[n] = np.log(np.where(is_pressed, moved, 1.0) / np.where(is_pressed, forces, 1.0)) / delta
         self._tangent = _Tangent(x, reach, forces, slopes)
 
-    @property
-    def reach(self) -> float:
-        """Greatest travel of the tangent's curve [m]."""
-        return self._tangent.reach
+    def trust_region(self, x: Array, region: Array) -> tuple[Array, Array]:
+        """Return the smallest and largest coordinates within bounds and within the reach of the curve, shape (n,) each.
+
+        Args:
+            x: centre, shape (n,).
+            region: half width in every coordinate, shape (n,).
+        """
+        low, high = self.problem.limits
+        margin = np.array(
+            [CONTACT_MARGIN * self._tangent.reach / (parameter.scale or 1) for parameter in self.problem.parameters]
+        )
+        below = np.where(self._is_contact, np.minimum(region, margin), region)
+        return np.maximum(low, x - below), np.minimum(high, x + region)
 
     def _reach(self, values: dict[str, float]) -> float:
         """Return the greatest travel of a curve [m]; raise a SceneError if it is 0 in all tests."""
         if not (reach := self.problem.reach(values)):
             raise SceneError(["contact: no test is deeper; take a smaller depth"])
-        return reach * (1 + CONTACT_MARGIN * self.is_contact.any())
+        return reach * (1 + CONTACT_MARGIN * self._is_contact.any())
 
     def _branches(self, values: dict[str, float]) -> list[tuple[float, float]]:
         """Return share and time [s] of every branch of relaxation."""
@@ -222,7 +231,7 @@ class CurveRuns(Runs):
 
     def _forces(self, values: dict[str, float], reach: float, halvings: int = 0) -> Array:
         """Return the forces of a curve at equidistant travels [N], shape (TRAVELS + 1,), with a cache."""
-        curve_values = [value for value, matters in zip(values.values(), self.is_of_curve, strict=True) if matters]
+        curve_values = [value for value, changes in zip(values.values(), self.changes_curve, strict=True) if changes]
         key = (halvings, reach, *curve_values)
         if key not in self._curves:
             self._report_progress()
@@ -251,7 +260,7 @@ def search_by_curve(runs: CurveRuns, misfit: Misfit, start: Array, first: Predic
         first: prediction at `start`.
 
     Returns:
-        Search by the last tangent, and solution with the forces of the test runs.
+        The search, whose Jacobian is that of the last tangent, and the solution, with the forces of runs of the tests.
 
     Raises:
         SceneError: when the scene is invalid in the neighbourhood of the solution.
@@ -266,10 +275,10 @@ def search_by_curve(runs: CurveRuns, misfit: Misfit, start: Array, first: Predic
             if (predicted := runs.predict_coarse(x, 0)) is not None:
                 costs.append((misfit.cost(misfit.residuals(predicted, solution.scales)), x.tolist()))
         starts = [np.array(x) for _, x in sorted(costs)[:2]]
-    # A lock or factor beyond the measured range has no effect there, with less than 3 sigma per unit of x, but may fit
-    # better at a smaller value.
-    information = np.linalg.norm(misfit.scaled(search.jacobian(solution), solution.scales), axis=0)
-    for n in np.flatnonzero(runs.is_of_curve & (information < 3.0)):
+    # A parameter with an effect below 3 sigma per unit of x, such as a lock beyond the measured range, may fit better
+    # at a smaller value.
+    effect = np.linalg.norm(misfit.scaled(search.jacobian(solution), solution.scales), axis=0)
+    for n in np.flatnonzero(runs.changes_curve & (effect < 3.0)):
         starts.append(solution.x.copy())
         starts[-1][n] = max(start[n] - 1, runs.problem.parameters[n].limits[0])
     for x in starts:
@@ -305,7 +314,7 @@ def _descend(runs: CurveRuns, misfit: Misfit, start: Array, *, by_tests: bool) -
 
     current = evaluate(start)
     # The trust region of curve parameters starts at 0.5, and grows to 2 at most, in units of x.
-    trial, region = current, np.where(runs.is_of_curve, 0.5, np.inf)
+    trial, region = current, np.where(runs.changes_curve, 0.5, np.inf)
     for step in range(20):
         if step and is_at_end(trial.cost, current.cost):
             return replace(min(trial, current, key=lambda each: each.cost), converged=True)
@@ -313,15 +322,14 @@ def _descend(runs: CurveRuns, misfit: Misfit, start: Array, *, by_tests: bool) -
             if not by_tests:
                 runs.set_tangent(trial.x)
             runs.correct(trial.x, trial.predicted)
-            current, region = trial, np.minimum(2 * region, np.where(runs.is_of_curve, 2.0, np.inf))
+            current, region = trial, np.minimum(2 * region, np.where(runs.changes_curve, 2.0, np.inf))
         else:
             shrunk = np.minimum(region, np.abs(trial.x - current.x)) / 4
-            region = (
-                shrunk
-                if by_tests
-                else np.where(runs.is_of_curve, shrunk.max(where=runs.is_of_curve, initial=0), region)
-            )
-        limits = _limits(runs, current.x, region)
+            # Curves limit the parameters that change the curve, all alike; runs of the tests limit each by itself.
+            if not by_tests:
+                shrunk = np.where(runs.changes_curve, shrunk.max(where=runs.changes_curve, initial=0), region)
+            region = shrunk
+        limits = runs.trust_region(current.x, region)
         starts = [current.x] if by_tests or step else [current.x, *_relaxation_starts(runs, misfit, current, limits)]
         minimum = min((Search(runs, misfit, limits).refine(x) for x in starts), key=lambda each: each.cost)
         if is_at_end(minimum.cost, current.cost):
@@ -333,17 +341,9 @@ def _descend(runs: CurveRuns, misfit: Misfit, start: Array, *, by_tests: bool) -
     return current
 
 
-def _limits(runs: CurveRuns, x: Array, region: Array) -> tuple[Array, Array]:
-    """Return the bounds of x, which keep depths of contact within the reach of the curve."""
-    low, high = runs.problem.limits
-    margin = np.array([CONTACT_MARGIN * runs.reach / (parameter.scale or 1) for parameter in runs.problem.parameters])
-    below = np.where(runs.is_contact, np.minimum(region, margin), region)
-    return np.maximum(low, x - below), np.minimum(high, x + region)
-
-
 def _relaxation_starts(runs: CurveRuns, misfit: Misfit, current: Solution, limits: tuple[Array, Array]) -> list[Array]:
-    """Return the two best of 64 starts that vary the parameters without a curve by a factor of at most 10."""
-    free = np.flatnonzero(~runs.is_of_curve)
+    """Return the two best of 64 starts, within a factor of 10 in the parameters that do not change the curve."""
+    free = np.flatnonzero(~runs.changes_curve)
     if not len(free):
         return []
     from scipy.stats import qmc

@@ -86,7 +86,7 @@ class MachineProblem(FitProblem):
         return self.approach.place(data, test.travel(contact), test.rate)
 
     def with_scene_values(self, data: dict[str, Any], values: Mapping[str, float]) -> dict[str, Any]:
-        """Return a scene's data with parameter values, and its own path and times.
+        """Return a scene's data with parameter values, and with unchanged path and times.
 
         Args:
             data: data of a scene, from `as_data`.
@@ -155,8 +155,8 @@ def table_paths(observed: Any) -> list[str]:
     if len(others) == len(paths) == 1:
         return []
     if others or not paths:
-        fault = "only tables of a testing machine can be several"
-        raise SceneError([f"{others[0] if others else 'observed'}: {fault}, {', '.join(TABLE_SUFFIXES)}"])
+        fault = f"not a table of a testing machine, {', '.join(TABLE_SUFFIXES)}; give tables only, or one other file"
+        raise SceneError([f"{others[0] if others else 'observed'}: {fault}"])
     return [str(path) for path in paths]
 
 
@@ -235,9 +235,9 @@ def _make_parameters(
     for key, test in zip(contacts, tests, strict=True):
         if key in free:
             # Depths of contact are in metres, as in the table; x is in units of their range.
-            low, high = first, last = float(test.depth[0]), float(test.depth.max())
-            if key in bounds:
-                low, high = max(first, bounds[key][0]), min(last, bounds[key][1])
+            first, last = float(test.depth[0]), float(test.depth.max())
+            low, high = bounds.get(key, (first, last))
+            low, high = max(first, low), min(last, high)
             if not (low <= test.contact <= high and low < high):
                 fault = f"the initial depth is {test.contact:.4g} m, and the greatest one of the table {last:.4g} m"
                 remedy = "take bounds around the initial depth, or another one by --contact"
