@@ -164,27 +164,27 @@ def _fit(runs: Runs, scene: Scene, method: Method) -> FitResult:
     error_correlation = ErrorCorrelation(method.get("correlation"), method.get("drift"))
     start = np.zeros(len(parameters))
     runs.expected = 8 * len(start) + 4
-    first = runs.first(start)
+    initial = runs.predict_initial(start)
     machine = runs.problem if isinstance(runs.problem, MachineProblem) else None
     problems: list[str] = []
     if machine is None:
-        problems += faults_at_start(observations, scene, first, parameters)
+        problems += faults_at_start(observations, scene, initial, parameters)
     if not any(probe.moved for probe in scene.probes):
         # Without position-controlled tools no tissue changes the forces, so a wrong unit is certain before the search.
-        problems += unit_faults(observations, first)
+        problems += unit_faults(observations, initial)
     if problems:
         raise SceneError(problems)
     signals = [observed.signal(scene) or 1.0 for observed in observations]
     misfit = Misfit(observations, signals, robust=method.get("robust", False))
     if isinstance(runs, CurveRuns):
-        search, solution = search_by_curve(runs, misfit, start, first)
+        search, solution = search_by_curve(runs, misfit, start, initial)
     else:
         search = Search(runs, misfit)
         if machine:
-            search.remember(start, first)
+            search.remember(start, initial)
         solution = search.best(start)
     # A wrong sign or unit contradicts both the initial and the fitted scene.
-    both = first, solution.predicted
+    both = initial, solution.predicted
     if problems := [*opposed(observations, scene, *both), *unit_faults(observations, *both)]:
         raise SceneError(problems)
     uncertainties = uncertainty(misfit, solution, search.jacobian(solution), error_correlation)
@@ -206,7 +206,7 @@ def _fit(runs: Runs, scene: Scene, method: Method) -> FitResult:
     for observed, part, sigma in zip(observations, residuals, uncertainties.scales, strict=True):
         summaries |= observed.summary(part, sigma)
     has_sigma = all(observed.sigma is not None for observed in observations)
-    notes = [*unit_faults(observations, first), *(note for fitted in tests for note in fitted.loading.test.notes)]
+    notes = [*unit_faults(observations, initial), *(note for fitted in tests for note in fitted.loading.test.notes)]
     notes += _search_notes(solution, parameters, fits_well=search.fits_well(solution))
     notes += _uncertainty_notes(parameters, solution.x, uncertainties, shifts, unidentified)
     notes += unknown_notes(tests, {key: values[key] for key, each in estimates.items() if not each.identifiable})
@@ -267,7 +267,7 @@ def _uncertainty_notes(
     """Yield warnings about mesh errors beyond the intervals, and about correlated, but identified parameters."""
     half_widths = uncertainties.quantile * uncertainties.deviations
     if shifts is not None and (moved := np.flatnonzero(shifts > half_widths).tolist()):
-        shares = [(parameters[n].key, parameters[n].share(x[n], float(shifts[n]))) for n in moved]
+        shares = [(parameters[n].key, parameters[n].relative_error(x[n], float(shifts[n]))) for n in moved]
         shifted_parameters = ", ".join(f"{key} by about {rounded(100 * share)} %" for key, share in shares)
         yield f"the mesh changes {shifted_parameters}, more than the interval; take more sheet.points"
     for n, m in zip(*np.nonzero(np.triu(np.abs(uncertainties.correlation) > 0.95, 1)), strict=True):
@@ -353,7 +353,7 @@ def _estimate(
         standard_error=parameter.error(x, deviation),
         interval=(interval[0], interval[1]),
         start=parameter.start,
-        identifiable=parameter.share(x, deviation) <= MAX_RELATIVE_ERROR,
+        identifiable=parameter.relative_error(x, deviation) <= MAX_RELATIVE_ERROR,
         mesh_error=None if shifts is None or math.isnan(shifts[index]) else parameter.error(x, float(shifts[index])),
     )
 

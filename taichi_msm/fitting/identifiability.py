@@ -81,7 +81,7 @@ def unidentified_groups(
     count, labels = connected_components(is_coupled[np.ix_(members, members)], directed=False)
     groups = [members[labels == label] for label in range(count)]
     pairs = zip(parameters, x.tolist(), uncertainties.deviations.tolist(), strict=True)
-    errors = np.array([parameter.share(coordinate, deviation) for parameter, coordinate, deviation in pairs])
+    errors = np.array([parameter.relative_error(coordinate, deviation) for parameter, coordinate, deviation in pairs])
     return [
         _describe_group(
             [parameters[n] for n in group],

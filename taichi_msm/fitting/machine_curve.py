@@ -106,7 +106,7 @@ class CurveRuns(Runs):
         self._is_contact = np.array([key.startswith("contact") for key in keys])
         self._is_lock = np.array([key.endswith(".lock") for key in keys])
 
-    def first(self, x: Array) -> Prediction:
+    def predict_initial(self, x: Array) -> Prediction:
         self._predictor.compile(x, self._report_progress)
         return self.run_curve(x)
 
@@ -250,14 +250,14 @@ class CurveRuns(Runs):
         return check_scene(Scene(**placed), self._predictor.maps)
 
 
-def search_by_curve(runs: CurveRuns, misfit: Misfit, start: Array, first: Prediction) -> tuple[Search, Solution]:
+def search_by_curve(runs: CurveRuns, misfit: Misfit, start: Array, initial: Prediction) -> tuple[Search, Solution]:
     """Minimise the misfit by tangents, then by curves, then by runs of the tests.
 
     Args:
         runs: predictions.
         misfit: residuals.
         start: initial coordinates of the parameters, shape (n,).
-        first: prediction at `start`.
+        initial: prediction at `start`.
 
     Returns:
         The search, whose Jacobian is that of the last tangent, and the solution, with the forces of runs of the tests.
@@ -267,7 +267,7 @@ def search_by_curve(runs: CurveRuns, misfit: Misfit, start: Array, first: Predic
         DivergedError: when the run of a curve diverges.
     """
     search = Search(runs, misfit)
-    solution = _descend(runs, misfit, _scale_stiffnesses(runs, misfit, start, first), by_tests=False)
+    solution = _descend(runs, misfit, _scale_stiffnesses(runs, misfit, start, initial), by_tests=False)
     starts = []
     if not search.fits_well(solution):
         costs = []

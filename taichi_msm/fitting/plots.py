@@ -87,7 +87,7 @@ def observation_panels(observed: Observation, fitted: Array, result: FitResult) 
         return [partial(panel, observed=observed, fitted=fitted) for panel in panels]
     if isinstance(observed, ToolForces):
         return [partial(_plot_forces, observed=observed, fitted=fitted)]
-    # The file is in the title of the figure if there is one test only.
+    # The file of a single test is in the title of the figure.
     titles = [printable(Path(test.loading.test.name).name) for test in result.tests]
     titles = ["Force over time"] if len(titles) == 1 else titles
     return [
@@ -101,13 +101,14 @@ def observation_panels(observed: Observation, fitted: Array, result: FitResult) 
     ]
 
 
-def _unit(observed: PointObservation) -> tuple[float, str]:
+def _plotted_unit(observed: PointObservation) -> tuple[float, str]:
+    """Return the factor from the unit of the values to the plotted one, and its name."""
     return (1000.0, "mm") if observed.unit == "m" else (1.0, "px")
 
 
 def _plot_motion(axes: Axes, observed: PointObservation, fitted: Array) -> None:
     """Plot the three points of largest motion over time, along their principal direction."""
-    scale, unit = _unit(observed)
+    scale, unit = _plotted_unit(observed)
     order, centre = np.argsort(observed.time), np.nanmean(fitted, axis=1, keepdims=True)
     motion = np.nan_to_num(fitted - centre)
     for n in np.argsort(-np.linalg.norm(motion, axis=(1, 2)))[:3]:
@@ -120,7 +121,7 @@ def _plot_motion(axes: Axes, observed: PointObservation, fitted: Array) -> None:
 
 
 def _plot_over_time(axes: Axes, time: Array, fitted: Array, observed: Array) -> None:
-    """Plot a fitted line and observed dots; the first ones have labels."""
+    """Plot a fitted line and observed dots, with labels for the first line of the panel."""
     labels = (None, None) if axes.lines else ("fitted", "observed")
     axes.plot(time, fitted, color=BLUE, label=labels[0])
     axes.plot(time, observed, ".", color=VERMILION, markersize=3, label=labels[1])
@@ -128,7 +129,7 @@ def _plot_over_time(axes: Axes, time: Array, fitted: Array, observed: Array) -> 
 
 def _plot_match(axes: Axes, observed: PointObservation, fitted: Array) -> None:
     """Plot observed against fitted values, both relative to the mean fitted position."""
-    scale, unit = _unit(observed)
+    scale, unit = _plotted_unit(observed)
     centre = np.nanmean(fitted, axis=1, keepdims=True)
     x, y = (scale * (values - centre)[observed.known] for values in (fitted, observed.values))
     subset = slice(None, None, math.ceil(len(x) / 20000) or 1)
@@ -141,7 +142,7 @@ def _plot_match(axes: Axes, observed: PointObservation, fitted: Array) -> None:
 
 def _plot_residuals(axes: Axes, observed: PointObservation, fitted: Array, sheet: Sheet) -> None:
     """Plot the residual of every point on the sheet."""
-    scale, unit = _unit(observed)
+    scale, unit = _plotted_unit(observed)
     residuals = scale * np.sqrt(np.nanmean((fitted - observed.values) ** 2, axis=(1, 2)))
     across, down = observed.coordinates.T
     dots = axes.scatter(across, down, 14, c=residuals, cmap="viridis", vmin=0)
@@ -215,6 +216,7 @@ def _plot_parameter(axes: Axes, result: FitResult, key: str) -> None:
 def _map_panels(fitted_map: FittedMap, sheet: Sheet) -> list[Panel]:
     """Return the panels of a map: the map, its errors, and the weight of its smoothness."""
     low, high = fitted_map.range
+    # The colours span a factor of at least 1.05.
     ratio, centre = np.sqrt(max(high / low, 1.05)), np.sqrt(low * high)
     norm, label = LogNorm(centre / ratio, centre * ratio), "factor of young"
     errors = 100 * fitted_map.errors

@@ -49,7 +49,7 @@ class FitProblem:
     """Scene, parameters and observations of a fit.
 
     Attributes:
-        signs: signs of the finite differences at the solution.
+        signs: sides of the finite differences at the solution: (1, -1) central, (1,) forward.
         token: identifier of the fit in worker processes.
         scene: scene with its initial values.
         parameters: parameters of the fit.
@@ -77,7 +77,7 @@ class FitProblem:
         """Return a scene's data with parameter values.
 
         Args:
-            data: data of a scene, as of `as_data`.
+            data: data of a scene, from `as_data`.
             values: values of all parameters by key.
         """
         return with_values(data, self.parameters, values)
@@ -141,7 +141,7 @@ class ForwardModel:
 
         Args:
             plan: plan of the run.
-            steps: smallest number of steps per frame, or None, as of `predict`.
+            steps: smallest number of steps per frame; None as for `predict`.
             coarse: number of halvings of the cells per side.
 
         Returns:
@@ -166,11 +166,11 @@ class ForwardModel:
             self._simulation.restart(plan)
         return self._simulation, plan
 
-    def compile(self, x: Array, pause: Pause = lambda: None) -> None:
-        """Compile the kernels.
+    def compile(self, x: Array, pause: Pause) -> None:
+        """Compile the kernels; raise a SceneError if the scene at x is invalid.
 
         Args:
-            x: coordinates of the parameters, shape (n,); raises a SceneError as `predict` does.
+            x: coordinates of the parameters, shape (n,).
             pause: called several times a second.
         """
         self._simulation = Simulation(self.plan(x), threads=self._threads)
@@ -181,7 +181,7 @@ class ForwardModel:
 
         Args:
             x: coordinates of the parameters, shape (n,).
-            steps: smallest number of steps per frame, or None, as of `predict`.
+            steps: smallest number of steps per frame; None as for `predict`.
             options: further arguments of `predict`.
         """
         try:
@@ -206,7 +206,7 @@ class ForwardModel:
     def record(
         self, models: Sequence[ObservationModel], simulation: Simulation, frames: int, pause: Pause
     ) -> list[Array]:
-        """Return the records of a run, a stack over all frames per model.
+        """Return the records of a run: for each model those of all frames, stacked.
 
         Args:
             models: observation models.
@@ -239,13 +239,13 @@ def difference_step(scene: Scene) -> float:
 _cached_models: dict[str, ForwardModel] = {}
 
 
-def predict(problem: FitProblem, x: Array, steps: int | None) -> Prediction | None:
-    """Return the prediction of a worker process on one thread, as `ForwardModel.try_predict` does.
+def predict_in_worker(problem: FitProblem, x: Array, steps: int | None) -> Prediction | None:
+    """Return the result of `ForwardModel.try_predict` in a worker process, on one thread.
 
     Args:
         problem: the fit; its forward model is kept for the next call.
         x: coordinates of the parameters, shape (n,).
-        steps: smallest number of steps per frame, or None, as of `ForwardModel.predict`.
+        steps: smallest number of steps per frame; None as for `ForwardModel.predict`.
     """
     if problem.token not in _cached_models:
         for token in list(_cached_models):
@@ -278,7 +278,7 @@ class Runs:
 
     Args:
         problem: the fit.
-        workers: number of worker processes, without a pool if it is 1; by default by the duration of the first run.
+        workers: number of worker processes, 1 for no pool; by default chosen by the duration of the first run.
         progress: called often with the stage, the finished and the expected number of runs; an exception from it ends
             the fit.
     """
@@ -291,8 +291,8 @@ class Runs:
         self._pool: Pool | None = None
         self._seconds = 0.0
 
-    def first(self, x: Array) -> Prediction:
-        """Return the prediction at x to the last frame; raises as `ForwardModel.predict` does."""
+    def predict_initial(self, x: Array) -> Prediction:
+        """Compile, and return the prediction at x to the last frame; raise the errors of `ForwardModel.predict`."""
         self._predictor.compile(x, self._report_progress)
         start = time.perf_counter()
         predicted = self._predictor.predict(x, to_end=True, pause=self._report_progress)
@@ -318,7 +318,7 @@ class Runs:
 
         Args:
             x: coordinates of the parameters, shape (n,).
-            steps: smallest number of steps per frame, or None, as of `ForwardModel.predict`.
+            steps: smallest number of steps per frame; None as for `ForwardModel.predict`.
         """
         self._report_progress()
         predicted = self._predictor.try_predict(x, steps, pause=self._report_progress)
@@ -330,7 +330,7 @@ class Runs:
 
         Args:
             coordinates: coordinates of the parameters of every run, each of shape (n,).
-            steps: smallest number of steps per frame, or None, as of `ForwardModel.predict`.
+            steps: smallest number of steps per frame; None as for `ForwardModel.predict`.
 
         Raises:
             ExecutorError: when a worker process dies.
@@ -339,7 +339,7 @@ class Runs:
             self._pool = Pool(workers)
         if self._pool is None or len(coordinates) < 2:
             return [self.predict_one(x, steps) for x in coordinates]
-        futures: list[Future[Any]] = [self._pool.submit(predict, self.problem, x, steps) for x in coordinates]
+        futures: list[Future[Any]] = [self._pool.submit(predict_in_worker, self.problem, x, steps) for x in coordinates]
         waiting = set(futures)
         while waiting:
             self._report_progress()

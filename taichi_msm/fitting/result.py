@@ -117,9 +117,9 @@ class FitResult:
         sigma: standard deviation of the values [m] or [px], given or estimated, or None without points.
         unit: unit of residual and sigma, m or px.
         chi_square: sum of (predicted - observed)^2 / sigma^2, or None without a given sigma.
-        degrees_of_freedom: number of observed numbers, minus the number of parameters except for a map.
+        degrees_of_freedom: number of observed numbers, of a fit of numbers less the number of parameters.
         identifiable: whether all parameters are identifiable.
-        unseen: groups of parameters that are not identifiable, or in combinations only.
+        unseen: groups of parameters that are not identifiable one by one.
         mesh_error: mesh error of the fitted scene, as a fraction of its largest displacement, or None if unknown.
         runs: number of runs.
         seconds: duration [s].
@@ -164,12 +164,14 @@ class FitResult:
 
     def as_json(self) -> dict[str, Any]:
         """Return JSON data, as in fit.json."""
-        names = "model_rejected correlation residual residual_force sigma sigma_force unit chi_square "
-        names += "degrees_of_freedom identifiable mesh_error"
+        names = (
+            "model_rejected correlation residual residual_force sigma sigma_force unit chi_square degrees_of_freedom "
+            "identifiable mesh_error runs seconds notes"
+        )
         return {
             "observed": self.observations[0].name,
             "parameters": {key: item._asdict() for key, item in self.parameters.items()},
-            **{name: getattr(self, name) for name in (*names.split(), "runs", "seconds", "notes")},
+            **{name: getattr(self, name) for name in names.split()},
             "unseen": [item.as_json() for item in self.unseen],
             **({} if self.map is None else {"map": self.map.as_json()}),
             **({"tests": [fitted.as_json() for fitted in self.tests]} if self.tests else {}),

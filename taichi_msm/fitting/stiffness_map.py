@@ -79,10 +79,8 @@ def map_settings(
     option = f"--free {KEY}"
     force_keys = [key for key in free if key != KEY]
     if conflicting := [key for key in force_keys if not FORCE_KEY.fullmatch(key)] + force_keys[1:]:
-        reason = (
-            f"only a map alone is identifiable, as {conflicting[0]} can have the effect of its level; leave that out"
-        )
-        raise SceneError([f"{option}: {reason}, or free one component of a force, whose factor all forces share"])
+        fault = f"not with {conflicting[0]}, which can have the effect of the level of the map; leave it out"
+        raise SceneError([f"{option}: {fault}, or free one component of a force, whose factor scales all forces"])
     if scene.tissue is None:
         raise SceneError([f"{option}: the scene has springs; describe them as tissue"])
     cells = min(scene.sheet.points) - 1
@@ -168,7 +166,7 @@ def fit_map(
     assert scene.tissue is not None
     update = {"map": StiffnessMap(image=image, range=fitted_map.range)}
     fitted_scene = scene.model_copy(update={"tissue": scene.tissue.model_copy(update=update)})
-    fitted_scene = with_scaled_forces(fitted_scene, *np.exp(solution.x[cell_count:]).tolist())
+    fitted_scene = with_scaled_forces(fitted_scene, solution.x[cell_count:])
     estimates, curves = {}, {}
     if settings.force is not None:
         key = settings.force.key
@@ -272,18 +270,17 @@ def _notes(
     limits: tuple[float, float],
     residuals: Array,
 ) -> Iterator[str]:
-    """Yield warnings; `residuals` are in [m] or [px]."""
+    """Yield warnings; `limits`: bounds of the logs of the factors, `residuals`: of all known values [m] or [px]."""
     assert observations.sigma is not None
     if (unknown_count := int(fitted_map.unknown.sum())) > 0:
         yield f"{unknown_count} of {fitted_map.factors.size} cells are unknown, as nothing moves there; press there"
     if mesh_shift > observations.sigma / 2:
-        size = f"about {rounded(mesh_shift)} {observations.unit}, and sigma is {rounded(observations.sigma)}"
-        remedy = "the map is as smooth as both require; take more sheet.points"
-        yield f"the mesh changes the observations by {size}: {remedy}"
+        shift = f"{rounded(mesh_shift)} {observations.unit} (sigma: {rounded(observations.sigma)})"
+        yield f"the mesh changes the observations by about {shift}, and smooths the map; take more sheet.points"
     if (share := float(np.sqrt(np.mean(residuals**2))) / observations.sigma) < 0.5:
         yield f"the residual is only {rounded(share)} times sigma: with a smaller sigma the map shows more"
-    if solution.excess > 1.5:
-        factor = rounded(math.sqrt(solution.excess))
+    if solution.variance > 1.5:
+        factor = rounded(math.sqrt(solution.variance))
         yield f"the residual is {factor} times the expected one with any map, and the errors are widened by this factor"
     logs = solution.x[: fitted_map.factors.size]
     if bounded := int((np.minimum(logs - limits[0], limits[1] - logs) < 1e-3).sum()):
