@@ -20,7 +20,6 @@ from taichi_msm.fitting import rejection
 from taichi_msm.fitting.archive import read_observations
 from taichi_msm.fitting.checks import faults, faults_at_start, opposed, unit_faults
 from taichi_msm.fitting.forces import read_forces
-from taichi_msm.fitting.identifiability import MAX_RELATIVE_ERROR, UnidentifiedGroup, unidentified_groups
 from taichi_msm.fitting.least_squares import Misfit, Search, Solution
 from taichi_msm.fitting.machine_curve import CurveRuns, has_curve, search_by_curve
 from taichi_msm.fitting.machine_fit import explanations, fitted_tests, unknown_notes
@@ -33,7 +32,13 @@ from taichi_msm.fitting.profiles import Profile, ProfilePoint, Profiler
 from taichi_msm.fitting.report import publication, write_report
 from taichi_msm.fitting.result import Estimate, FitResult, FittedMap
 from taichi_msm.fitting.stiffness_map import KEY, MapSettings, fit_map, map_settings
-from taichi_msm.fitting.uncertainty import Uncertainty, uncertainty
+from taichi_msm.fitting.uncertainty import (
+    MAX_RELATIVE_ERROR,
+    Uncertainty,
+    UnidentifiedGroup,
+    uncertainty,
+    unidentified_groups,
+)
 from taichi_msm.load.check import check_scene
 from taichi_msm.load.scene_file import load_scene
 from taichi_msm.scene.scene import Scene

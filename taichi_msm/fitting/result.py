@@ -10,13 +10,13 @@ from typing import Any, ClassVar, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from taichi_msm.fitting.identifiability import UnidentifiedGroup
 from taichi_msm.fitting.machine_fit import FittedTest
 from taichi_msm.fitting.observation import Array, Observation
 from taichi_msm.fitting.parameters import rounded
 from taichi_msm.fitting.points import PointObservation
 from taichi_msm.fitting.profiles import ProfilePoint
 from taichi_msm.fitting.tikhonov import SmoothnessWeight
+from taichi_msm.fitting.uncertainty import UnidentifiedGroup
 from taichi_msm.scene.scene import Scene
 
 

@@ -12,7 +12,6 @@ import numpy as np
 from taichi_msm.accuracy.mesh import coarser_plan
 from taichi_msm.errors import SceneError, StageProgressCallback
 from taichi_msm.fitting.checks import faults, faults_at_start
-from taichi_msm.fitting.identifiability import MAX_RELATIVE_ERROR
 from taichi_msm.fitting.observation import Array
 from taichi_msm.fitting.parameters import Bounds, Parameter, make_parameters, rounded
 from taichi_msm.fitting.points import PointModel, PointObservation
@@ -21,6 +20,7 @@ from taichi_msm.fitting.profiles import ProfilePoint
 from taichi_msm.fitting.rejection import by_chi_square
 from taichi_msm.fitting.result import Estimate, FitResult, FittedMap
 from taichi_msm.fitting.tikhonov import MapGrid, MapSearch, MapSolution, centres, with_scaled_forces
+from taichi_msm.fitting.uncertainty import MAX_RELATIVE_ERROR
 from taichi_msm.gradients.gradient import Adjoint, require_differentiable
 from taichi_msm.load.check import check_scene
 from taichi_msm.model.plan import Plan
