@@ -86,7 +86,7 @@ def read_camera(keys: Keys) -> Calibration:
 
 
 def read_pose(keys: Keys) -> StereoPose | None:
-    """Read R and T, keys without the mark of a camera (R1 and R2 belong to a rectification); None without both."""
+    """Read R and T, keys without the mark of a camera (R1 and R2 are of a rectification); None if both are missing."""
     unmarked = {name: value for name, value in keys.data.items() if keys.folded[name] == fold(name)}
     shared = Keys(keys.file, unmarked, lines=keys.lines)
     if not shared.values(ROTATION) and not shared.values(TRANSLATION):

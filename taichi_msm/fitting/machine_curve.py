@@ -17,7 +17,7 @@ with G, share_i, phi_i and memory s_i as in `terms/viscoelasticity.py`.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from contextlib import suppress
 from dataclasses import replace
 from typing import NamedTuple
@@ -25,7 +25,7 @@ from typing import NamedTuple
 import numpy as np
 
 from taichi_msm.errors import DivergedError, SceneError, StageProgressCallback
-from taichi_msm.fitting.least_squares import Misfit, Search, Solution
+from taichi_msm.fitting.least_squares import Misfit, Scales, Search, Solution
 from taichi_msm.fitting.machine_model import MachineModel, MachineProblem
 from taichi_msm.fitting.observation import Array
 from taichi_msm.fitting.predict import FitProblem, Prediction, Runs, difference_step, mesh_error
@@ -270,11 +270,8 @@ def search_by_curve(runs: CurveRuns, misfit: Misfit, start: Array, initial: Pred
     solution = _descend(runs, misfit, _scale_stiffnesses(runs, misfit, start, initial), by_tests=False)
     starts = []
     if not search.fits_well(solution):
-        costs = []
-        for x in search.alternative_starts():
-            if (predicted := runs.predict_coarse(x, 0)) is not None:
-                costs.append((misfit.cost(misfit.residuals(predicted, solution.scales)), x.tolist()))
-        starts = [np.array(x) for _, x in sorted(costs)[:2]]
+        predictions = ((x, runs.predict_coarse(x, 0)) for x in search.alternative_starts())
+        starts = _two_best(predictions, misfit, solution.scales)
     # A parameter with an effect below 3 sigma per unit of x, such as a lock beyond the measured range, may fit better
     # at a smaller value.
     effect = np.linalg.norm(misfit.scaled(search.jacobian(solution), solution.scales), axis=0)
@@ -350,10 +347,16 @@ def _relaxation_starts(runs: CurveRuns, misfit: Misfit, current: Solution, limit
 
     max_log = np.log(10.0)
     low, high = (np.clip(limit[free], current.x[free] - max_log, current.x[free] + max_log) for limit in limits)
-    costs = []
-    for shares in qmc.Sobol(len(free), seed=1).random(64):
-        x = current.x.copy()
-        x[free] = low + shares * (high - low)
-        if (predicted := runs.predict_one(x)) is not None:
-            costs.append((misfit.cost(misfit.residuals(predicted, current.scales)), x.tolist()))
+    starts = np.tile(current.x, (64, 1))
+    starts[:, free] = low + qmc.Sobol(len(free), seed=1).random(64) * (high - low)
+    return _two_best(((x, runs.predict_one(x)) for x in starts), misfit, current.scales)
+
+
+def _two_best(predictions: Iterable[tuple[Array, Prediction | None]], misfit: Misfit, scales: Scales) -> list[Array]:
+    """Return the two coordinates of lowest cost; None is the prediction of a failed run."""
+    costs = [
+        (misfit.cost(misfit.residuals(predicted, scales)), x.tolist())
+        for x, predicted in predictions
+        if predicted is not None
+    ]
     return [np.array(x) for _, x in sorted(costs)[:2]]

@@ -206,7 +206,7 @@ def read_machine_problem(
     placed = approach.place(as_data(without_outputs(scene)), first.travel(), first.rate)
     observations = MachineForces(
         ", ".join(loading.test.name for loading in tests),
-        np.concatenate([loading.scene_time for loading in tests]),
+        np.concatenate([np.arange(len(loading.force)) / loading.rate for loading in tests]),
         np.concatenate([loading.force for loading in tests])[:, None],
         np.repeat([loading.sigma for loading in tests], lengths),
         approach,

@@ -4,10 +4,13 @@ With J the Jacobian of the residuals r by x, the covariance of x is
 
     C = f (J^T W J)^-1 M (J^T W J)^-1,    M = J^T W^(1/2) K W^(1/2) J
 
-with W = 1 and K = 1, and f the mean of r^2 per degree of freedom, at least 1. In a robust fit W is the second
-derivative of rho / 2, and f the mean square of its first derivative over the mean of W. K is the correlation of the
-errors: exp(-distance / correlation) for two tracks at a time, exp(-interval / drift) for a track at two times, or the
-product of both. With the singular value decomposition W^(1/2) J = U S V^T,
+- W is 1; in a robust fit the second derivative of rho / 2.
+- f, at least 1, is the mean of r^2 per degree of freedom; in a robust fit the mean square of the first derivative of
+  rho / 2, over the mean of W.
+- K, the correlation of the errors, is 1; of tracks exp(-distance / correlation) at one time, exp(-interval / drift) of
+  one track, or the product of both.
+
+With the singular value decomposition W^(1/2) J = U S V^T,
 
     C = f V S^-1 (U^T K U) S^-1 V^T
 

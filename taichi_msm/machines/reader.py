@@ -120,7 +120,7 @@ def read_machine_test(
         grid = read_text(name, lambda row: _is_header(row, chosen), EXPECTED)
     else:
         raise SceneError([f"--sheet {sheet}: {name} is a text, without sheets; leave the option out"])
-    # Without a block of enough rows, a shorter one gets an error about them.
+    # A block of too few rows counts only if there is no other; `_read_block` then raises the error.
     blocks = _find_blocks(grid, chosen) or _find_blocks(grid, chosen, min_rows=0)
     if not blocks:
         raise SceneError([_missing_header(grid, chosen)])
@@ -387,7 +387,7 @@ def _rows_of_numbers(grid: Grid, block: _Block, columns: list[_Column]) -> Itera
         is_complete = len(cells) == len(indices)
         if is_complete and not any(cells):
             continue
-        # Text may contain numbers, so that only the time, or the first cell, of a short row decides.
+        # A row of text may contain numbers: of a short row only the time decides, or else the first cell.
         if not any(map(VALUE_START.match, cells if is_complete else row[indices[0] :][:1] or row[:1])):
             text = n if text is None else text
         elif text is None:
