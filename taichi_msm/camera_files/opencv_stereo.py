@@ -36,8 +36,8 @@ def _cameras(file: CameraFile) -> Sequence[Keys]:
 def _pose(keys: Keys) -> StereoPose | None:
     """Read R and T; unknown keys that may define another unit or pose are an error."""
     if names := keys.unread(r"units?|[rt]c?m+|rt|extrinsics?"):
-        fault = f"{listed(names)}: not understood; write R, 3 x 3, and T, 3 numbers"
-        raise keys.fault(f"{fault}, in metres, or set calibration_unit: mm, and remove these", names[0])
+        remedy = "write R (3 x 3) and T (3 numbers) in metres, or set calibration_unit: mm, and remove the unknown keys"
+        raise keys.fault(f"{listed(names)}: unknown; {remedy}", names[0])
     return read_pose(keys)
 
 

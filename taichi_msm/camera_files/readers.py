@@ -128,8 +128,8 @@ def _times(file: CameraFile, trajectory: Trajectory, keys: PoseKeys) -> list[flo
     if (start := keys.poses_start) is None:
         return times
     if start > times[-1]:
-        times_text = f"{times[0]:.15g} s to {times[-1]:.15g} s"
-        raise file.fault(f"poses_start: {start:.15g} s is after its poses, at {times_text}; take a time of these")
+        remedy = f"take a time from {times[0]:.15g} s to {times[-1]:.15g} s"
+        raise file.fault(f"poses_start: {start:.15g} s is after the last pose; {remedy}")
     # A time before the first pose counts from that pose. Differences of large times are rounded to their resolution.
     is_after_first = start >= times[0] or math.isclose(start, times[0], abs_tol=1e-9)
     origin, digits = start if is_after_first else times[0] + start, int(-math.log10(math.ulp(times[-1])))

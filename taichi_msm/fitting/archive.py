@@ -150,7 +150,7 @@ def _require_supported(name: str, keys: list[str]) -> None:
     """Raise a SceneError about arrays that are not supported, but whose names suggest observations."""
     ignored = [key for key in keys if key not in MEMBERS and SUGGESTIVE_PARTS.search(key.lower())]
     if ignored:
-        fault = "not supported; take NaN where not observed, or visible or occluded (N, T), and sigma for errors"
+        fault = "not supported; take NaN, visible or occluded (N, T) for missing points, and sigma for errors"
         raise SceneError([f"{name}: {', '.join(map(ascii, ignored))}: {fault}"])
 
 

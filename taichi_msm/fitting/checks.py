@@ -58,7 +58,7 @@ def faults_at_start(
         moving = np.flatnonzero(first.motion > 0.5 * motion) / rate
         yield (
             f"{name}: its {len(observations[0].time)} times miss the motion: "
-            f"the scene's points move by up to {1000 * motion:.3g} mm, but by {1000 * observed_motion:.3g} mm then; "
+            f"the scene's points then move by {1000 * observed_motion:.3g} of {1000 * motion:.3g} mm; "
             f"add times between {moving[0]:g} and {moving[-1]:g} s"
         )
         return

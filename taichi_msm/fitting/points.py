@@ -321,7 +321,7 @@ class Positions(PointObservation):
             MAX_OFFSET_SHARE * max(scene.sheet.size),
             "they are at rest in the scene",
             "count from the sheet's middle, x right, y up, z toward the viewer",
-            ("-x, right of the middle above 0", "-y, above the middle above 0"),
+            ("-x, positive right of the middle", "-y, positive above the middle"),
         )
 
     def faults(self, scene: Scene) -> Iterator[str]:

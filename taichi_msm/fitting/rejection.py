@@ -58,8 +58,8 @@ def by_pattern(
     if error_correlation.correlation is None:
         first, second = _neighbours(coordinates)
         if _is_positive((clipped[first] * clipped[second]).sum(axis=(1, 2)), 24):
-            fault = "the residuals of neighbouring points are correlated, unlike independent errors"
-            return f"{fault}; if the errors are, {remedy}"
+            reason = "the residuals of neighbouring points are correlated, unlike independent errors"
+            return f"{reason}; for correlated errors {remedy}"
     if error_correlation.drift is None:
         products = (clipped[:, 1:] * clipped[:, :-1]).sum(axis=2)
         if _is_positive(products.ravel() if error_correlation.correlation is None else products.sum(axis=0), 4):
