@@ -46,6 +46,7 @@ def read_observations(observed: str | Path | Mapping[str, Any], rate: float) -> 
     if isinstance(observed, Mapping):
         name, names = "observed", [str(key) for key in observed]
         _require_supported(name, names)
+        # Masked numbers are not observed.
         filled = (np.ma.filled(1.0 * value, np.nan) if np.ma.isMA(value) else value for value in observed.values())
         arrays = {key: as_array(value, key) for key, value in zip(names, filled, strict=True)}
     else:

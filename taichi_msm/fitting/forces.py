@@ -146,10 +146,11 @@ def read_forces(path: str | Path, sigma: float, probes: int) -> ToolForces:
     columns = [names.index(key) for key in COLUMNS]
     _require_units(grid.place(header), [units[column] for column in columns])
     rows = [n for n in range(header + 1, len(grid.rows)) if grid.has_content(n)]
+    # The first row below the header may consist of units.
     first_row = grid.rows[rows[0]] if rows else []
-    units = [first_row[column].strip("[]() ") if column < len(first_row) else "" for column in columns]
-    if units[0].isalpha() and units[0].lower() != "nan":
-        _require_units(grid.place(rows.pop(0)), units)
+    row_units = [first_row[column].strip("[]() ") if column < len(first_row) else "" for column in columns]
+    if row_units[0].isalpha() and row_units[0].lower() != "nan":
+        _require_units(grid.place(rows.pop(0)), row_units)
     for n in rows:
         grid.require_width(n, header)
         if (count := grid.counts[n]) < len(names):
@@ -195,7 +196,7 @@ def _is_header(row: Row) -> bool:
 
 
 def _require_units(where: str, units: Sequence[str]) -> None:
-    """Raise a SceneError unless units are absent, seconds and newtons."""
+    """Raise a SceneError unless every unit is missing, or seconds or newtons as in `COLUMNS`."""
     for (key, expected), unit in zip(COLUMNS.items(), units, strict=True):
         if unit not in (expected, "", "-", "1"):
             raise SceneError([f"{where}: {key}: unit {unit!r}; give seconds and newtons"])

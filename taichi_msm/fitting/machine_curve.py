@@ -51,10 +51,10 @@ def has_curve(problem: object) -> bool:
 
 
 def relax(elastic: Array, branches: Sequence[tuple[float, float]], h: float) -> Array:
-    """Return the force of relaxing tissue [N], shape (frames,).
+    """Return the forces F_n of relaxing tissue [N], shape (frames,).
 
     Args:
-        elastic: elastic force at every frame [N], shape (frames,).
+        elastic: elastic forces f_n [N], shape (frames,).
         branches: share and time [s] of every branch.
         h: time between frames [s].
     """
@@ -215,7 +215,7 @@ class CurveRuns(Runs):
         return branches
 
     def _predict(self, values: dict[str, float], reach: float, forces: Array) -> Prediction:
-        """Predict the tests by a curve."""
+        """Predict the tests by a curve of `forces`, at equidistant travels up to `reach` [m]."""
         from scipy.interpolate import PchipInterpolator
 
         curve = PchipInterpolator(np.linspace(0, reach, TRAVELS + 1), forces)
@@ -305,15 +305,15 @@ def _descend(runs: CurveRuns, misfit: Misfit, start: Array, *, by_tests: bool) -
         predicted = runs.run_tests(x) if by_tests else runs.run_curve(x)
         return Solution(x, predicted, scales, misfit.cost(misfit.residuals(predicted, scales)), converged=False)
 
-    def is_at_end(cost: float, current: float) -> bool:
+    def is_converged(cost: float, previous: float) -> bool:
         # A third of a standard deviation of a parameter changes the cost by 0.05.
-        return abs(current - cost) <= max(1e-3 * current, 0.05)
+        return abs(previous - cost) <= max(1e-3 * previous, 0.05)
 
     current = evaluate(start)
     # The trust region of curve parameters starts at 0.5, and grows to 2 at most, in units of x.
     trial, region = current, np.where(runs.changes_curve, 0.5, np.inf)
     for step in range(20):
-        if step and is_at_end(trial.cost, current.cost):
+        if step and is_converged(trial.cost, current.cost):
             return replace(min(trial, current, key=lambda each: each.cost), converged=True)
         if trial.cost <= current.cost:
             if not by_tests:
@@ -329,7 +329,7 @@ def _descend(runs: CurveRuns, misfit: Misfit, start: Array, *, by_tests: bool) -
         limits = runs.trust_region(current.x, region)
         starts = [current.x] if by_tests or step else [current.x, *_relaxation_starts(runs, misfit, current, limits)]
         minimum = min((Search(runs, misfit, limits).refine(x) for x in starts), key=lambda each: each.cost)
-        if is_at_end(minimum.cost, current.cost):
+        if is_converged(minimum.cost, current.cost):
             return replace(current, converged=True)
         try:
             trial = evaluate(runs.with_valid_shares(minimum.x))
