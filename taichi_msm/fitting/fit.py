@@ -66,9 +66,9 @@ def fit(
             trajectory.npz or tracks.npz. Or one or more tables of a testing machine, .csv, .tsv, .txt or .xlsx, with
             time, depth and force, which the scene's only position-controlled tool follows.
         free: keys of the parameters, dotted paths such as tissue.young or probes.0.total.2. tissue.map is a map of
-            R x R cells; one component of a force may be free with it, whose factor then scales all forces. contact, or
-            contact.0, ... of several tables, is the depth of contact [m of the table].
-        bounds: smallest and largest value of a parameter, by key; of tissue.map those of its factors.
+            R x R cells; with it one component of a force may be free, and its factor then scales all forces. contact,
+            or contact.0, ... of several tables, is the depth of contact [m of the table].
+        bounds: smallest and largest value by key; for tissue.map the smallest and largest factor.
         forces: a forces.csv of the same motion, and the standard deviation of its forces [N].
         directory: directory for fit.json, scene.yaml, fit.png and a map's pictures; by default none is written.
         workers: number of worker processes; by default chosen by the duration of the first run.

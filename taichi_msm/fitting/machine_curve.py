@@ -93,7 +93,7 @@ class CurveRuns(Runs):
     """
 
     problem: MachineProblem
-    _predictor: MachineModel
+    _model: MachineModel
     _tangent: _Tangent
 
     def __init__(self, problem: FitProblem, workers: int | None, progress: StageProgressCallback) -> None:
@@ -107,7 +107,7 @@ class CurveRuns(Runs):
         self._is_lock = np.array([key.endswith(".lock") for key in keys])
 
     def predict_initial(self, x: Array) -> Prediction:
-        self._predictor.compile(x, self._report_progress)
+        self._model.compile(x, self._report_progress)
         return self.run_curve(x)
 
     def predict_one(self, x: Array, steps: int | None = None) -> Prediction | None:
@@ -115,7 +115,7 @@ class CurveRuns(Runs):
             return self.predict_coarse(x, 0)
         tangent = self._tangent
         try:
-            values = self._predictor.values(x)
+            values = self._model.values(x)
         except SceneError:
             return None
         distance = x - tangent.x
@@ -130,7 +130,7 @@ class CurveRuns(Runs):
 
     def mesh_error(self, x: Array) -> float | None:
         # The run of the curve has the mesh error of the tests.
-        values = self._predictor.values(x)
+        values = self._model.values(x)
         return mesh_error(self._plan_curve(values, self._reach(values)), self._report_progress)
 
     def run_curve(self, x: Array, halvings: int = 0) -> Prediction:
@@ -140,14 +140,14 @@ class CurveRuns(Runs):
             x: coordinates of the parameters, shape (n,).
             halvings: number of halvings of the cells per side.
         """
-        values = self._predictor.values(x)
+        values = self._model.values(x)
         reach = self._reach(values)
         return self._predict(values, reach, self._forces(values, reach, halvings))
 
     def run_tests(self, x: Array) -> Prediction:
         """Return the prediction by runs of the tests at x; raise the errors of `ForwardModel.predict`."""
         self.count += len(self.problem.tests)
-        return self._predictor.predict(x, pause=self._report_progress)
+        return self._model.predict(x, pause=self._report_progress)
 
     def correct(self, x: Array, predicted: Prediction) -> None:
         """Add the error of the tangent at x to all further predictions.
@@ -161,7 +161,7 @@ class CurveRuns(Runs):
 
     def with_valid_shares(self, x: Array) -> Array:
         """Return x, with the free shares scaled down if all shares sum to more than `MAX_SHARES`."""
-        values = self._predictor.values(x)
+        values = self._model.values(x)
         branches = self._branches(values)
         free = [key for n in range(len(branches)) if (key := f"tissue.relaxation.{n}.share") in values]
         total = sum(share for share, _ in branches)
@@ -174,14 +174,14 @@ class CurveRuns(Runs):
 
     def set_tangent(self, x: Array) -> None:
         """Linearise the curve at x; raise the errors of `ForwardModel.predict`."""
-        values = self._predictor.values(x)
+        values = self._model.values(x)
         reach = self._reach(values)
         forces, slopes = self._forces(values, reach), np.zeros((len(x), TRAVELS + 1))
         for n in np.flatnonzero(self.changes_curve):
             shifted, delta = x.copy(), difference_step(self.problem.scene)
             delta = delta if x[n] + delta <= self.problem.parameters[n].limits[1] else -delta
             shifted[n] += delta
-            moved = self._forces(self._predictor.values(shifted), reach)
+            moved = self._forces(self._model.values(shifted), reach)
             is_pressed = (forces > 0) & (moved > 0)
             slopes[n] = np.log(np.where(is_pressed, moved, 1.0) / np.where(is_pressed, forces, 1.0)) / delta
         self._tangent = _Tangent(x, reach, forces, slopes)
@@ -209,7 +209,7 @@ class CurveRuns(Runs):
     def _branches(self, values: dict[str, float]) -> list[tuple[float, float]]:
         """Return share and time [s] of every branch of relaxation."""
         branches = []
-        for n, branch in enumerate(self._predictor.data.get("tissue", {}).get("relaxation", ())):
+        for n, branch in enumerate(self._model.data.get("tissue", {}).get("relaxation", ())):
             key = f"tissue.relaxation.{n}"
             branches.append((values.get(f"{key}.share", branch["share"]), values.get(f"{key}.time", branch["time"])))
         return branches
@@ -235,19 +235,19 @@ class CurveRuns(Runs):
         key = (halvings, reach, *curve_values)
         if key not in self._curves:
             self._report_progress()
-            simulation, plan = self._predictor.start(self._plan_curve(values, reach), None, halvings)
-            self._curves[key] = self._predictor.forces(simulation, plan, self._report_progress)[:, 0]
+            simulation, plan = self._model.start(self._plan_curve(values, reach), None, halvings)
+            self._curves[key] = self._model.forces(simulation, plan, self._report_progress)[:, 0]
             self.count += 1
         return self._curves[key]
 
     def _plan_curve(self, values: dict[str, float], reach: float) -> Plan:
         """Plan a run with equidistant travels up to `reach` [m], without relaxation."""
-        data = self.problem.with_scene_values(self._predictor.data, values)
+        data = self.problem.with_scene_values(self._model.data, values)
         if branches := data.get("tissue", {}).get("relaxation"):
             still_branches = [{**branch, "share": NO_SHARE} for branch in branches]
             data = {**data, "tissue": {**data["tissue"], "relaxation": still_branches}}
         placed = self.problem.approach.place(data, np.linspace(0, reach, TRAVELS + 1), 1.0)
-        return check_scene(Scene(**placed), self._predictor.maps)
+        return check_scene(Scene(**placed), self._model.maps)
 
 
 def search_by_curve(runs: CurveRuns, misfit: Misfit, start: Array, initial: Prediction) -> tuple[Search, Solution]:

@@ -111,14 +111,14 @@ class MachineModel(ForwardModel):
         x: Array,
         steps: int | None = None,
         *,
-        coarse: int = 0,
+        halvings: int = 0,
         to_end: bool = False,  # Ignored: every run ends with its test.
         pause: Pause = lambda: None,
     ) -> Prediction:
         forces, most_steps = [], 0
         for n in range(len(self.problem.tests)):
             data = self.problem.fitted_data(self.data, self.values(x), n)
-            simulation, plan = self.start(check_scene(Scene(**data), self.maps), steps, coarse)
+            simulation, plan = self.start(check_scene(Scene(**data), self.maps), steps, halvings)
             forces.append(self.forces(simulation, plan, pause))
             most_steps = max(most_steps, plan.grid.steps_per_frame)
         return Prediction((np.concatenate(forces),), most_steps, np.zeros(1))

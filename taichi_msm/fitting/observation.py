@@ -26,10 +26,10 @@ MAX_COSINE, MIN_SIGMAS, MIN_COUNT = -0.9, 5.0, 3
 
 
 class ErrorCorrelation(NamedTuple):
-    """Correlation lengths of tracking errors; None for independent errors."""
+    """Correlation of tracking errors in space and time; None for independent errors."""
 
-    correlation: float | None  # length between tracks [px]
-    drift: float | None  # time within a track [s]
+    length: float | None  # correlation length of neighbouring tracks [px]
+    drift: float | None  # correlation time of a track [s]
 
 
 class ObservationModel(ABC):
@@ -157,7 +157,7 @@ class Observation(ABC):
         Args:
             residuals: predicted minus observed values, with the shape of `values`.
             signal: root mean square from `signal` [unit].
-            correlation: given correlation lengths of the errors.
+            correlation: given correlation of the errors.
         """
         return None
 
@@ -170,7 +170,7 @@ class Observation(ABC):
 
         Args:
             rows: R, shape (known, n).
-            correlation: correlation lengths that define K.
+            correlation: correlation of the errors, which defines K.
         """
         return rows.T @ rows, float(len(rows))
 
@@ -180,7 +180,7 @@ class Observation(ABC):
         Args:
             predicted: values predicted by the solution, with the shape of `values`.
             signal: root mean square from `signal` [unit].
-            correlation: given correlation lengths of the errors.
+            correlation: given correlation of the errors.
         """
         yield from ()
 

@@ -242,9 +242,9 @@ class PointObservation(Observation):
         # Distances are between mean pixels; tracks without observations are left out.
         is_tracked: NDArray[np.bool_] = np.any(self.is_observed, axis=1)
         space, time = np.eye(int(is_tracked.sum())), np.eye(len(self.time))
-        if correlation.correlation is not None:
+        if correlation.length is not None:
             pixels = np.nanmean(self.values[is_tracked], axis=1)
-            space = np.exp(-cdist(pixels, pixels) / correlation.correlation)
+            space = np.exp(-cdist(pixels, pixels) / correlation.length)
         if correlation.drift is not None:
             time = np.exp(-np.abs(self.time[:, None] - self.time) / correlation.drift)
         by_track = np.zeros((*self.values.shape, rows.shape[1]))
@@ -262,7 +262,7 @@ class PointObservation(Observation):
                 yield "the residual is almost 0, and so are the intervals; give the standard deviation by --sigma"
             return
         space_correlation, time_correlation = _residual_correlations(residuals, self.coordinates)
-        if space_correlation > MIN_ERROR_CORRELATION and correlation.correlation is None:
+        if space_correlation > MIN_ERROR_CORRELATION and correlation.length is None:
             remedy = f"; {self.correlation_remedy}" if self.correlation_remedy else ""
             fault = f"the residuals of neighbouring points are correlated (by {space_correlation:.2f})"
             yield f"{fault}, so that the intervals are too narrow{remedy}"

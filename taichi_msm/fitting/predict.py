@@ -110,7 +110,7 @@ class ForwardModel:
         x: Array,
         steps: int | None = None,
         *,
-        coarse: int = 0,
+        halvings: int = 0,
         to_end: bool = False,
         pause: Pause = lambda: None,
     ) -> Prediction:
@@ -119,7 +119,7 @@ class ForwardModel:
         Args:
             x: coordinates of the parameters, shape (n,).
             steps: smallest number of steps per frame; by default enough for finite differences around x.
-            coarse: number of halvings of the cells per side.
+            halvings: number of halvings of the cells per side.
             to_end: whether to simulate to the last frame, beyond the last observation.
             pause: called several times a second; an exception from it ends the run.
 
@@ -127,7 +127,7 @@ class ForwardModel:
             SceneError: when the scene with these values is not valid, or has too few mass points to be coarsened.
             DivergedError: when the run diverges.
         """
-        simulation, plan = self.start(self.plan(x), steps, coarse)
+        simulation, plan = self.start(self.plan(x), steps, halvings)
         # The mesh of a coarse run differs.
         models = [observed.build_model(plan.scene, self._frames) for observed in self.problem.observations]
         frames = max(self._frames, plan.grid.frames + 1) if to_end else self._frames
@@ -136,13 +136,13 @@ class ForwardModel:
         motion = np.max([model.motion(recorded) for model, recorded in pairs], axis=0)
         return Prediction(values, plan.grid.steps_per_frame, motion)
 
-    def start(self, plan: Plan, steps: int | None, coarse: int) -> tuple[Simulation, Plan]:
+    def start(self, plan: Plan, steps: int | None, halvings: int) -> tuple[Simulation, Plan]:
         """Restart the simulation.
 
         Args:
             plan: plan of the run.
             steps: smallest number of steps per frame; None as for `predict`.
-            coarse: number of halvings of the cells per side.
+            halvings: number of halvings of the cells per side.
 
         Returns:
             The simulation, and its plan with these cells and steps.
@@ -150,7 +150,7 @@ class ForwardModel:
         Raises:
             SceneError: when the plan has too few mass points to be coarsened.
         """
-        for _ in range(coarse):
+        for _ in range(halvings):
             if (coarser := coarser_plan(plan)) is None:
                 raise SceneError(["sheet.points: too few to take half of them"])
             plan = coarser
@@ -287,15 +287,15 @@ class Runs:
         self.problem = problem
         self.count = self.expected = 0  # number of finished runs, and the expected number
         self._workers, self._progress = workers, progress
-        self._predictor = problem.build_model(threads=None)
+        self._model = problem.build_model(threads=None)
         self._pool: Pool | None = None
         self._seconds = 0.0
 
     def predict_initial(self, x: Array) -> Prediction:
         """Compile, and return the prediction at x to the last frame; raise the errors of `ForwardModel.predict`."""
-        self._predictor.compile(x, self._report_progress)
+        self._model.compile(x, self._report_progress)
         start = time.perf_counter()
-        predicted = self._predictor.predict(x, to_end=True, pause=self._report_progress)
+        predicted = self._model.predict(x, to_end=True, pause=self._report_progress)
         self._seconds, self.count = time.perf_counter() - start, self.count + 1
         return predicted
 
@@ -307,11 +307,11 @@ class Runs:
             halvings: number of halvings of the cells per side.
         """
         self.count += 1
-        return self._predictor.try_predict(x, coarse=halvings, pause=self._report_progress)
+        return self._model.try_predict(x, halvings=halvings, pause=self._report_progress)
 
     def mesh_error(self, x: Array) -> float | None:
         """Return the estimated mesh error at x, as the function `mesh_error` does."""
-        return mesh_error(self._predictor.plan(x), self._report_progress)
+        return mesh_error(self._model.plan(x), self._report_progress)
 
     def predict_one(self, x: Array, steps: int | None = None) -> Prediction | None:
         """Return the prediction at x, or None if it fails.
@@ -321,7 +321,7 @@ class Runs:
             steps: smallest number of steps per frame; None as for `ForwardModel.predict`.
         """
         self._report_progress()
-        predicted = self._predictor.try_predict(x, steps, pause=self._report_progress)
+        predicted = self._model.try_predict(x, steps, pause=self._report_progress)
         self.count += 1
         return predicted
 
@@ -369,4 +369,4 @@ class Runs:
     def __exit__(self, kind: object, *_: object) -> None:
         if self._pool is not None:
             self._pool.shutdown(cancel_futures=kind is not None)
-        self._predictor.close()
+        self._model.close()

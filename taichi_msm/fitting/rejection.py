@@ -47,7 +47,7 @@ def by_pattern(
         time: times of the observations [s], shape (T,).
         coordinates: coordinates of the points on the sheet, shape (N, 2).
         motion: root mean square of the observed motion [m] or [px].
-        error_correlation: given correlation lengths of the errors.
+        error_correlation: given correlation of the errors.
         remedy: remedy for correlated errors of neighbouring points, for the reason.
     """
     # Smaller residuals are due to rounding and the tolerance of the search.
@@ -55,14 +55,14 @@ def by_pattern(
         return None
     limit = 4.0 * np.nanmedian(np.abs(residuals))
     clipped = np.nan_to_num(np.clip(residuals, -limit, limit))[:, np.argsort(time)]
-    if error_correlation.correlation is None:
+    if error_correlation.length is None:
         first, second = _neighbours(coordinates)
         if _is_positive((clipped[first] * clipped[second]).sum(axis=(1, 2)), 24):
             reason = "the residuals of neighbouring points are correlated, unlike independent errors"
             return f"{reason}; for correlated errors {remedy}"
     if error_correlation.drift is None:
         products = (clipped[:, 1:] * clipped[:, :-1]).sum(axis=2)
-        if _is_positive(products.ravel() if error_correlation.correlation is None else products.sum(axis=0), 4):
+        if _is_positive(products.ravel() if error_correlation.length is None else products.sum(axis=0), 4):
             reason = "the residuals of a point are correlated in time, unlike independent errors"
             return f"{reason}; if the tracks drift, give --drift SECONDS"
     return None

@@ -7,8 +7,8 @@ With J the Jacobian of the residuals r by x, the covariance of x is
 - W is 1; in a robust fit the second derivative of rho / 2.
 - f, at least 1, is the mean of r^2 per degree of freedom; in a robust fit the mean square of the first derivative of
   rho / 2, over the mean of W.
-- K, the correlation of the errors, is 1; of tracks exp(-distance / correlation) at one time, exp(-interval / drift) of
-  one track, or the product of both.
+- K, the correlation of the errors, is 1; of tracks exp(-distance / length) at one time, exp(-interval / drift) of one
+  track, or the product of both.
 
 With the singular value decomposition W^(1/2) J = U S V^T,
 
@@ -118,7 +118,7 @@ def uncertainty(
         misfit: residuals.
         solution: minimum of their cost.
         derivatives: Jacobian of the predictions by x, shape (known, n).
-        error_correlation: correlation lengths of the errors, which define K.
+        error_correlation: correlation of the errors, which defines K.
     """
     parameters = len(solution.x)
     freedom = max(1, sum(misfit.count) - parameters)
