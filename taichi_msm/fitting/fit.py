@@ -141,7 +141,6 @@ def _read_problem(
 ) -> tuple[FitProblem, MapSettings | None]:
     """Return the problem of a fit to points and forces, and the settings of its map, None for a fit of numbers."""
     points = read_observations(observed, initial.time.frames_per_second).with_sigma(method.get("sigma"))
-    observations: tuple[Observation, ...] = (points,)
     if unused := [name for name in TABLE_OPTIONS if method.get(name)]:
         raise SceneError([f"--{unused[0]}: only for tables of a testing machine; leave it out"])
     settings = map_settings(initial, free, bounds, method.get("resolution"))
@@ -149,8 +148,8 @@ def _read_problem(
     if settings is not None and (conflicting := [name for name, value in options.items() if value]):
         raise SceneError([f"--free {KEY}: --{conflicting[0]} is only for fits of numbers; leave it out"])
     parameters = () if settings is not None else make_parameters(initial, free, bounds)
-    if forces is not None:
-        observations = (points, read_forces(forces[0], forces[1], len(initial.probes)))
+    measured = [] if forces is None else [read_forces(*forces, len(initial.probes))]
+    observations: tuple[Observation, ...] = (points, *measured)
     if (correlation := method.get("correlation")) is not None:
         if not 0 < correlation < math.inf:
             raise SceneError([f"--correlation {correlation:g}: take a number of pixels above 0"])
@@ -194,7 +193,7 @@ def _fit(runs: Runs, scene: Scene, method: Method) -> FitResult:
         raise SceneError(problems)
     uncertainties = uncertainty(misfit, solution, search.jacobian(solution), error_correlation)
     if isinstance(runs, CurveRuns):
-        runs.by_tangent = False
+        runs.by_tangent = False  # Profiles are those of curves.
     profiles = Profiler(runs, misfit, solution, uncertainties).profiles() if method.get("profile") else None
     mesh_error, shifts = _mesh_effect(runs, misfit, solution, uncertainties)
     estimates = {

@@ -230,7 +230,8 @@ def _make_parameters(
     of_scene = [key for key in free if key not in contacts]
     parameters = {}
     if of_scene or not free:
-        limits = {key: ends for key, ends in bounds.items() if key not in free or key not in contacts}
+        # Bounds of keys that are not free are an error of `make_parameters`.
+        limits = {key: ends for key, ends in bounds.items() if key not in {*free} & {*contacts}}
         parameters = {parameter.key: parameter for parameter in make_parameters(scene, of_scene, limits)}
     for key, test in zip(contacts, tests, strict=True):
         if key in free:

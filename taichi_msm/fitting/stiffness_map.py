@@ -91,7 +91,7 @@ def map_settings(
         raise SceneError([f"--resolution {resolution}: {remedy}"])
     if unknown := [key for key in bounds if key not in free]:
         raise SceneError([f"--bounds {unknown[0]}: not among --free; take {KEY}=LOW,HIGH, factors of young"])
-    low, high = bounds.get(KEY, (DEFAULT_LOW, DEFAULT_HIGH))
+    low, high = bounds.get(KEY, (-math.inf, math.inf))
     low, high = (DEFAULT_LOW if low == -math.inf else low), (DEFAULT_HIGH if high == math.inf else high)
     interval = f"--bounds {KEY}={low:g},{high:g}"
     if not 0 < low < high:
@@ -144,15 +144,17 @@ def fit_map(
 
     search: MapSearch | None = None
     report_progress()
-    position = adjoint.run(grid.factors(start[:cell_count]), report_progress)
-    points = _initial_points(position, model, observations, scene)
+    at_frames = model.on_sheet(adjoint.run(grid.factors(start[:cell_count]), report_progress))
+    initial = model.predict(at_frames)
+    if invalid := list(faults_at_start([observations], scene, Prediction((initial,), 0, model.motion(at_frames)))):
+        raise SceneError(invalid)
     mesh_shift = 0.0
     if (coarse_plan := coarser_plan(plan)) is not None:
         coarse_factors = MapGrid(settings.resolution, _cells(coarse_plan)).factors(start[:cell_count])
         coarse_model = PointModel(coarse_plan.scene, observations, coarse_plan.grid.frames + 1)
         coarse_points = coarse_model.points(Adjoint(coarse_plan, device).run(coarse_factors, report_progress))
         # Richardson extrapolation of order 2, from half the cells per side.
-        differences = (coarse_model.observe(coarse_points) - model.observe(points))[observations.known] / 3.0
+        differences = (coarse_model.observe(coarse_points) - initial)[observations.known] / 3.0
         mesh_shift = float(np.sqrt(np.nanmean(differences**2)))
     sigma = math.hypot(observations.sigma, mesh_shift)
     force_limits = settings.force.limits if settings.force else None
@@ -222,16 +224,6 @@ def _faults(observations: PointObservation, scene: Scene, settings: MapSettings)
         yield f"--resolution {settings.resolution}: {fault}, and {free / 2**30:.3g} GiB is free; {remedy}"
         return
     yield from faults([observations], scene, settings.resolution**2)
-
-
-def _initial_points(position: Array, model: PointModel, observations: PointObservation, scene: Scene) -> Array:
-    """Return the observed points in the initial run [m], shape (N, T, 3); raise a SceneError if implausible."""
-    at_frames = model.on_sheet(position)
-    points = model.interpolate(at_frames)
-    prediction = Prediction((model.observe(points),), 0, model.motion(at_frames))
-    if invalid := list(faults_at_start([observations], scene, prediction)):
-        raise SceneError(invalid)
-    return points
 
 
 def _with_stable_steps(plan: Plan, high: float) -> Plan:

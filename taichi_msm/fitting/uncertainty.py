@@ -249,8 +249,8 @@ def _describe_group(
     return UnidentifiedGroup(keys, known, f"{combinations}, each alone {share or 'is not'}: fix one{remedy}")
 
 
-def _complement(directions: Array) -> Iterator[Array]:
-    """Yield a basis of the orthogonal complement of directions, shape (m, directions), in reduced echelon form."""
+def _complement(directions: Array) -> Array:
+    """Return a basis of the orthogonal complement of directions, shape (m, directions), in reduced echelon form."""
     vectors, singular, _ = np.linalg.svd(directions)
     rank = int(np.sum(singular > MIN_GROUP_COMPONENT * singular[0]))
     rows = vectors[:, rank:].T.copy()
@@ -263,4 +263,4 @@ def _complement(directions: Array) -> Iterator[Array]:
         for row in range(len(rows)):
             if row != n:
                 rows[row] -= rows[row, pivot] * rows[n]
-    yield from rows
+    return rows
