@@ -63,13 +63,13 @@ def faults_at_start(
         )
         return
     same_camera = not any(parameter.key.startswith("render.") for parameter in parameters)
-    problems = [
+    messages = [
         fault
         for observed, predicted in zip(observations, initial.values, strict=True)
         for fault in observed.faults_at_start(scene, predicted, same_camera=same_camera)
     ]
-    yield from problems
-    if not problems and all(parameter.is_log for parameter in parameters):
+    yield from messages
+    if not messages and all(parameter.is_log for parameter in parameters):
         yield from opposed(observations, scene, initial)
 
 

@@ -157,8 +157,8 @@ def _read_problem(
             raise SceneError([f"{points.name}: --correlation is in pixels, and these are positions; leave it out"])
     if (drift := method.get("drift")) is not None and not 0 < drift < math.inf:
         raise SceneError([f"--drift {drift:g}: take a number of seconds above 0"])
-    if settings is None and (problems := list(faults(observations, initial, len(parameters)))):
-        raise SceneError(problems)
+    if settings is None and (messages := list(faults(observations, initial, len(parameters)))):
+        raise SceneError(messages)
     return FitProblem(secrets.token_hex(8), without_outputs(initial), parameters, observations), settings
 
 
@@ -170,14 +170,14 @@ def _fit(runs: Runs, scene: Scene, method: Method) -> FitResult:
     runs.expected = 8 * len(start) + 4
     initial = runs.predict_initial(start)
     machine = runs.problem if isinstance(runs.problem, MachineProblem) else None
-    problems: list[str] = []
+    messages: list[str] = []
     if machine is None:
-        problems += faults_at_start(observations, scene, initial, parameters)
+        messages += faults_at_start(observations, scene, initial, parameters)
     if not any(probe.moved for probe in scene.probes):
         # Without position-controlled tools no tissue changes the forces, so a wrong unit is certain before the search.
-        problems += unit_faults(observations, initial)
-    if problems:
-        raise SceneError(problems)
+        messages += unit_faults(observations, initial)
+    if messages:
+        raise SceneError(messages)
     signals = [observed.signal(scene) or 1.0 for observed in observations]
     misfit = Misfit(observations, signals, robust=method.get("robust", False))
     if isinstance(runs, CurveRuns):
@@ -189,8 +189,8 @@ def _fit(runs: Runs, scene: Scene, method: Method) -> FitResult:
         solution = search.best(start)
     # A wrong sign or unit contradicts both the initial and the fitted scene.
     both = initial, solution.predicted
-    if problems := [*opposed(observations, scene, *both), *unit_faults(observations, *both)]:
-        raise SceneError(problems)
+    if messages := [*opposed(observations, scene, *both), *unit_faults(observations, *both)]:
+        raise SceneError(messages)
     uncertainties = uncertainty(misfit, solution, search.jacobian(solution), error_correlation)
     if isinstance(runs, CurveRuns):
         runs.by_tangent = False  # Profiles are those of curves.
