@@ -169,9 +169,7 @@ def _read_members(name: str, archive: zipfile.ZipFile) -> tuple[Arrays, list[str
                 arrays[key] = np.lib.format.read_array(member, allow_pickle=False)
         except Exception as error:  # Errors of zipfile, its decompressors and NumPy are of any kind.
             reason = "cannot be read: " + (str(error).partition("\n")[0] or type(error).__name__)
-            if info.flag_bits & 1:
-                reason = "cannot be read: encrypted"
-            elif "Object arrays" in reason:
+            if "Object arrays" in reason:
                 reason = "an array of Python objects"
             raise SceneError([f"{name}: {key}: {reason}; write it again by np.savez, as numbers"]) from None
     return arrays, list(infos)

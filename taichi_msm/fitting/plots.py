@@ -129,11 +129,10 @@ def _plot_match(axes: Axes, observed: PointObservation, fitted: Array) -> None:
     centre = np.nanmean(fitted, axis=1, keepdims=True)
     x, y = (scale * (values - centre)[observed.known] for values in (fitted, observed.values))
     # At most 20000 dots are drawn.
-    subset = slice(None, None, math.ceil(len(x) / 20000) or 1)
+    subset = slice(None, None, math.ceil(len(x) / 20000))
     axes.scatter(x[subset], y[subset], 2, color=BLUE, alpha=0.4, linewidths=0)
-    if len(x):
-        ends = [float(x.min()), float(x.max())]
-        axes.plot(ends, ends, color=GREY, linewidth=0.8)
+    ends = [float(x.min()), float(x.max())]
+    axes.plot(ends, ends, color=GREY, linewidth=0.8)
     axes.set(title="Observed against fitted", xlabel=f"fitted, from the mean [{unit}]", ylabel=f"observed [{unit}]")
 
 
