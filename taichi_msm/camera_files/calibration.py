@@ -71,6 +71,6 @@ class CalibrationReader(NamedTuple):
     recognised_by: str  # content by which a file is recognised, for users
     cameras: Callable[[CameraFile], Sequence[Keys]]  # keys of each camera, the left one first; empty for another format
     read: Callable[[Keys], Calibration]
-    # From the keys of the right camera, its pose in the unit of the file.
+    # Function that returns the pose of the right camera from its keys, in the unit of the file.
     pose: Callable[[Keys], StereoPose | None] = lambda keys: None
     unit: float | None = 1.0  # unit of lengths in the file [m]; None where the format does not define it

@@ -123,7 +123,7 @@ def _require_agreement(keys: Keys, focal: Sequence[float], centre: Sequence[floa
             math.isclose(a, b, rel_tol=ROUNDING_TOLERANCE) for a, b in zip(numbers, values, strict=False)
         ):
             names, found = listed(keys.values(spelling)), ", ".join(f"{number:g}" for number in numbers)
-            raise keys.fault(f"{names}: {found}, unlike the camera matrix; keep one", keys.find(spelling))
+            raise keys.fault(f"{names}: {found} differs from the camera matrix; keep one", keys.find(spelling))
 
 
 def _model(keys: Keys, values: Sequence[float], *, has_xi: bool) -> str:
@@ -138,8 +138,8 @@ def _model(keys: Keys, values: Sequence[float], *, has_xi: bool) -> str:
             raise keys.fault(f"{name}: {truncate(str(value))} is not supported; expected one of: {known}", name)
         if model == NO_DISTORTION and any(values):
             coefficients = ", ".join(f"{number:g}" for number in values)
-            remedy = "write the model of these, such as plumb_bob or equidistant, or zeros"
-            raise keys.fault(f"{name}: {value}, and coefficients that are not 0: {coefficients}; {remedy}", name)
+            remedy = "write their model, such as plumb_bob or equidistant, or zeros"
+            raise keys.fault(f"{name}: {value}, but the coefficients are not 0: {coefficients}; {remedy}", name)
         sources |= {model: name} if model else {}
     for name, value in keys.values(FISHEYE).items():
         if (flag := fold(value)) not in FLAGS:
