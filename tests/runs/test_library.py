@@ -49,6 +49,7 @@ def simulation(device: Device) -> Iterator[Simulation]:
 
 
 def test_public_names(message: Messages) -> None:
+    assert dir(taichi_msm) == sorted(taichi_msm.__all__)
     for name in taichi_msm.__all__:
         exported = getattr(taichi_msm, name)
         assert exported.__name__ == name

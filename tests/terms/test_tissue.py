@@ -24,6 +24,7 @@ from taichi_msm.load.check import check_scene
 from taichi_msm.load.scene_file import load_scene
 from taichi_msm.model.plan import Plan
 from taichi_msm.model.sheet import Maps, rest_positions
+from taichi_msm.model.tool_force import describe_forces, probe_records
 from taichi_msm.runs.run import resume, run
 from taichi_msm.runs.simulation import Simulation
 from taichi_msm.scene.scene import Scene
@@ -297,6 +298,7 @@ def test_warning_of_a_partial_tool(load: Any, message: Messages) -> None:
     assert not warnings()
     message(warnings("probes.0.at=[1.9, 0.5]"))
     message(warnings("probes.0={total: [0, 0, 1], falloff: 5000}"))
+    message(map(describe_forces, probe_records(load("probes.0.radius=5"))), hide=r"\d\.\d+")
 
 
 def test_resumption_with_a_map(
