@@ -326,6 +326,12 @@ def test_one_device_per_process(device: Device, message: Messages) -> None:
         Simulation(scene(), threads=device.threads + 1)
 
 
+def test_steered_tool_is_drawn_with_its_instrument(simulation: Simulation) -> None:
+    bare, probe = simulation.draw(), simulation.scene.probes[0]
+    simulation.steer([probe.model_copy(update={"instrument": {"radius": 0.02, "shaft": [0, 0, 1], "length": 0.1}})])
+    assert (simulation.draw() != bare).any()
+
+
 def test_html_of_a_frame(simulation: Simulation, message: Messages) -> None:
     page = simulation._repr_html_()
     assert page
