@@ -127,6 +127,7 @@ def test_warnings_of_missing_and_doubtful_estimates(device: Device, message: Mes
     rounded = TimeStepEstimate(10, 0.02, 0.02, 0.02, 2, separate=False)
     message(warnings(RunErrorEstimates(rounded, "", MeshEstimate(0.004, WRINKLING), ForceEstimate(0.03))))
     message(warnings(RunErrorEstimates(reason=QUASISTATIC_REASON, mesh=MeshEstimate(0.004, OVERLAP))))
+    message(warnings(RunErrorEstimates(mesh=MeshEstimate(0.02, WRINKLING))))
     for doubt in (NARROW_TIP, NOT_CONVERGED, LARGE_STEP_ERROR):
         message(warnings(RunErrorEstimates(mesh=MeshEstimate(math.inf, doubt))), "mesh error not known")
     for known in (RunErrorEstimates(), RunErrorEstimates(mesh=MeshEstimate(0.004))):
