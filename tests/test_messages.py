@@ -107,34 +107,11 @@ def test_invalid_options_of_fits(free: list[str], options: dict[str, object], me
         fit(made, observed, free, workers=1, **options)  # type: ignore[arg-type]
 
 
-# Messages of processes killed at a certain moment, of foreign machines and of defects.
+# Messages of GPUs that end threads early, and of a run that was killed and continued.
 NOT_PROVOKED = {
-    "% in the middle,",
-    "% of the peak, at",
-    ", and sigma is",
-    ", or smaller --bounds",
-    ": not among --free; take",
     ": the device left out part of the work (",
-    ": the frames with the largest displacement of",
-    "; no film was written",
-    "=LOW,HIGH, factors of young",
-    "MB unpacked; save the sheet as CSV",
-    "cells are unknown, as nothing moves there; press there",
-    "cells ended at a bound,",
-    "if they were run here",
-    "mesh error of the fitted scene:",
-    "not a flow of",
     "pieces), so pictures and labels would be wrong; take --arch cpu",
-    "runs have ended before",
-    "s is too long for a factor of",
-    "s or less, or auto",
     "the forces of the frames before the run was continued are not kept",
-    "the map is as smooth as both require; take more sheet.points",
-    "the mesh changes the observations by",
-    "the pool was shut down",
-    "the residual is only",
-    "times sigma: with a smaller sigma the map shows more",
-    "times the expected one with any map, and the errors are widened by this factor",
 }
 
 # Modules whose texts are help, labels of plots and contents of files, and calls and names with such texts.

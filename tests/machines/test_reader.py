@@ -432,6 +432,13 @@ def test_faults_of_a_sheet(name: str, save: Save, message: Messages) -> None:
     assert len(caught.value.lines) == 1
 
 
+def test_large_workbook(save: Save, monkeypatch: pytest.MonkeyPatch, message: Messages) -> None:
+    path = save({"FF2": SHEET})
+    monkeypatch.setattr("taichi_msm.machines.cells.MAX_UNPACKED_BYTES", 1000)
+    with message.raises(SceneError, "tests.xlsx", hide=r"\d+(?= MB)"):
+        read_machine_test(path)
+
+
 def test_openpyxl_is_not_installed(monkeypatch: pytest.MonkeyPatch, message: Messages) -> None:
     monkeypatch.setitem(sys.modules, "openpyxl", None)
     with message.raises(NotInstalledError, "openpyxl"):
