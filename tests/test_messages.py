@@ -83,6 +83,13 @@ def test_invalid_keys_of_sweeps(key: str, small: Path, message: Messages) -> Non
         load_sweep("sweep.yaml")
 
 
+@pytest.mark.parametrize("text", ["", "3"], ids=["no keys", "a number"])
+def test_files_without_a_sweep(text: str, small: Path, message: Messages) -> None:
+    Path("sweep.yaml").write_text(text)
+    with message.raises(SceneError, "sweep.yaml"):
+        load_sweep("sweep.yaml")
+
+
 def test_player_without_frames(message: Messages) -> None:
     with message.raises(ArgumentError, "frames"):
         Player([], 25)

@@ -464,6 +464,7 @@ def implausible(tracks: Arrays, mass: Arrays) -> dict[str, dict[str, Any]]:
         "places": {**tracks, "coordinates": 512 * PLACES},
         "texts": {**tracks, "coordinates": PLACES.astype("U8")},
         "lacks": {"time": time, "pixel": pixel},
+        "lacks values": {"time": time, "coordinates": PLACES},
         "both": {**tracks, "position": np.zeros((36, 11, 3))},
     }
 
