@@ -91,6 +91,11 @@ class Messages:
         assert self._count <= len(known), f"not in {FILE.name} (write it with --write-messages): {text}"
         assert text == known[self._count - 1]
 
+    def require_all(self) -> None:
+        """Require that the test has provoked all its messages in the golden file."""
+        known = read().get(self._tests, {}).get(self._test, [])
+        assert self._written is not None or self._count == len(known), f"{self._count} of {len(known)} messages"
+
     @contextmanager
     def raises(
         self, error: type[AnyError] | tuple[type[AnyError], ...], *words: str, hide: str = r"(?!)"

@@ -211,8 +211,8 @@ def _fit(runs: Runs, scene: Scene, method: Method) -> FitResult:
         summaries |= observed.summary(part, sigma)
     has_sigma = all(observed.sigma is not None for observed in observations)
     notes = [*unit_faults(observations, initial), *(note for fitted in tests for note in fitted.loading.test.notes)]
-    notes += _search_notes(solution, parameters, fits_well=search.fits_well(solution))
-    notes += _uncertainty_notes(parameters, solution.x, uncertainties, shifts, unidentified)
+    notes += search_notes(solution, parameters, fits_well=search.fits_well(solution))
+    notes += uncertainty_notes(parameters, solution.x, uncertainties, shifts, unidentified)
     notes += unknown_notes(tests, {key: values[key] for key, each in estimates.items() if not each.identifiable})
     if rejection_reason:
         notes += explanations(tests, fits_contact=any(key.startswith("contact") for key in values))
@@ -247,28 +247,45 @@ def _fit(runs: Runs, scene: Scene, method: Method) -> FitResult:
     )
 
 
-def _search_notes(solution: Solution, parameters: Sequence[Parameter], *, fits_well: bool) -> Iterator[str]:
-    """Yield warnings about the search; `fits_well`: whether the residual is small."""
+def search_notes(solution: Solution, parameters: Sequence[Parameter], *, fits_well: bool) -> Iterator[str]:
+    """Yield warnings about the search.
+
+    Args:
+        solution: solution found.
+        parameters: parameters of the fit.
+        fits_well: whether the residual is small.
+    """
     if not solution.converged:
         yield "the search did not converge; take closer initial values by --set, or give --bounds"
     if not fits_well:
-        yield "the residual is large: no values of these parameters reproduce the observations"
+        fault = "the residual is large: no values of these parameters reproduce the observations"
+        yield f"{fault}; free more of them, or check the scene"
     for parameter, x in zip(parameters, solution.x.tolist(), strict=True):
         low, high = parameter.limits
         if min(x - low, high - x) < 1e-3:
-            bounded = math.isfinite(parameter.low) or math.isfinite(parameter.high)
-            end = "a bound" if bounded else "a factor of 1000 from the initial value"
-            yield f"{parameter.key}: ended at {parameter.value(x):.4g}, {end}: its interval is not reliable"
+            end, remedy = "a factor of 1000 from the initial value", "take a closer one by --set"
+            if math.isfinite(parameter.low) or math.isfinite(parameter.high):
+                end, remedy = "a bound", "widen --bounds, or fix it"
+            ended = f"{parameter.key}: ended at {parameter.value(x):.4g}, {end}"
+            yield f"{ended}, so its interval is not reliable; {remedy}"
 
 
-def _uncertainty_notes(
+def uncertainty_notes(
     parameters: Sequence[Parameter],
     x: Array,
     uncertainties: Uncertainty,
     shifts: Array | None,
     unidentified: Sequence[UnidentifiedGroup],
 ) -> Iterator[str]:
-    """Yield warnings about mesh errors beyond the intervals, and about correlated, but identified parameters."""
+    """Yield warnings about mesh errors beyond the intervals, and about correlated, but identified parameters.
+
+    Args:
+        parameters: parameters of the fit.
+        x: their coordinates at the solution, shape (n,).
+        uncertainties: uncertainty of the solution.
+        shifts: mesh errors in units of x, shape (n,), NaN if unknown; None if all are.
+        unidentified: groups of parameters that are not identifiable.
+    """
     half_widths = uncertainties.quantile * uncertainties.deviations
     if shifts is not None and (moved := np.flatnonzero(shifts > half_widths).tolist()):
         shares = [(parameters[n].key, parameters[n].relative_error(x[n], float(shifts[n]))) for n in moved]

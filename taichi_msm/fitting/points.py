@@ -263,9 +263,9 @@ class PointObservation(Observation):
             return
         space_correlation, time_correlation = _residual_correlations(residuals, self.coordinates)
         if space_correlation > MIN_ERROR_CORRELATION and correlation.length is None:
-            remedy = f"; {self.correlation_remedy}" if self.correlation_remedy else ""
+            remedy = self.correlation_remedy or "take fewer of them, farther apart"
             fault = f"the residuals of neighbouring points are correlated (by {space_correlation:.2f})"
-            yield f"{fault}, so that the intervals are too narrow{remedy}"
+            yield f"{fault}, so that the intervals are too narrow; {remedy}"
         elif time_correlation > MIN_ERROR_CORRELATION and correlation.drift is None:
             fault = f"the residuals of a point are correlated in time (by {time_correlation:.2f})"
             yield f"{fault}, so that the intervals are too narrow; give --drift SECONDS"

@@ -348,7 +348,7 @@ class Runs:
         try:
             return [future.result() for future in futures]
         except DiedError as error:
-            raise ExecutorError(f"a run of the fit ended early: {error}; take fewer --workers") from None
+            raise ExecutorError(f"a run of the fit ended early: {error}") from None
 
     def _choose_workers(self) -> int:
         if self._workers is not None:

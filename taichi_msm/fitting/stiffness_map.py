@@ -188,7 +188,7 @@ def fit_map(
         identifiable=not fitted_map.unknown.any() and all(estimate.identifiable for estimate in estimates.values()),
         mesh_error=mesh_error(mapped_plan, report_progress),
         runs=search.runs + 1,
-        notes=list(_notes(observations, solution, fitted_map, mesh_shift, limits, residuals)),
+        notes=list(map_notes(observations, solution, fitted_map, mesh_shift, limits, residuals)),
         scene=fitted_scene,
         observations=(observations,),
         fitted=(fitted,),
@@ -254,7 +254,7 @@ def _cells(plan: Plan) -> tuple[int, int]:
     return rows - 1, cols - 1
 
 
-def _notes(
+def map_notes(
     observations: PointObservation,
     solution: MapSolution,
     fitted_map: FittedMap,
@@ -262,7 +262,16 @@ def _notes(
     limits: tuple[float, float],
     residuals: Array,
 ) -> Iterator[str]:
-    """Yield warnings; `limits`: bounds of the logs of the factors, `residuals`: of all known values [m] or [px]."""
+    """Yield warnings about a map.
+
+    Args:
+        observations: observed points, with sigma.
+        solution: solution found.
+        fitted_map: its map.
+        mesh_shift: root mean square change of the observations by the mesh [m] or [px].
+        limits: bounds of the logs of the factors.
+        residuals: predicted minus observed values [m] or [px], shape (known,).
+    """
     assert observations.sigma is not None
     if (unknown_count := int(fitted_map.unknown.sum())) > 0:
         yield f"{unknown_count} of {fitted_map.factors.size} cells are unknown, as nothing moves there; press there"

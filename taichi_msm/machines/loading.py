@@ -197,7 +197,15 @@ def build_loading(
 
 
 def require_plausible_travel(loading: Loading, scene: Scene) -> None:
-    """Raise a SceneError if the tool travels ten sizes of the sheet or more, probably because of another unit."""
+    """Require that the tool travels less than ten sizes of the sheet, as it does in another unit.
+
+    Args:
+        loading: the test.
+        scene: supplies the size of the sheet.
+
+    Raises:
+        SceneError: when the tool travels farther.
+    """
     travel, side = float(loading.travel().max()), max(scene.sheet.size)
     if travel > 10 * side:
         fault = f"depth: the tool travels {travel:.4g} m, and the sheet is {side:g} m long"

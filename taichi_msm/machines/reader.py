@@ -193,10 +193,8 @@ def _choose_sheet(name: str, sheets: dict[str, Grid], chosen: str | None, tables
         if len(tables) > 1:
             raise SceneError([f"{name}: {len(tables)} sheets with a table; choose one by --sheet: {', '.join(tables)}"])
         if not tables and len(sheets) != 1:
-            listed = ", ".join(sheets) or "none has cells"
-            raise SceneError(
-                [f"{name}: no sheet has a table of time, depth and force; choose one by --sheet: {listed}"]
-            )
+            remedy = f"choose one by --sheet: {', '.join(sheets)}" if sheets else "save one with cells"
+            raise SceneError([f"{name}: no sheet has a table of time, depth and force; {remedy}"])
         chosen = next(iter(tables or sheets))
     for title, grid in sheets.items():
         if title.casefold() == chosen.casefold():

@@ -175,7 +175,7 @@ def read_flo(path: Path, size: tuple[int, int]) -> NDArray[np.float32]:
         # One byte more than expected detects a longer file, without reading all of a forged one.
         start, data, excess = file.read(len(header)), file.read(length), file.read(1)
     if start != header or len(data) != length or excess:
-        raise ValueError(f"not a flow of {width} x {height} pixels")
+        raise ValueError(f"{path}: not a flow of {width} x {height} pixels; run the scene again")
     return np.frombuffer(data, "<f4").reshape(height, width, 2)
 
 

@@ -16,6 +16,7 @@ from PIL import Image
 from taichi_msm.errors import FilesError
 from taichi_msm.exports.export import export
 from taichi_msm.exports.kitti import encode_flow
+from taichi_msm.runs.arrays import read_flo
 from tests.golden import Messages
 from tests.outputs import files
 from tests.runs.test_finished import change
@@ -141,3 +142,9 @@ def test_damaged_results(name: str, change: Callable[[Path], object], labelled: 
     with message.raises(FilesError, name, hide=r"(?<=decoded )\(.*\)"):
         export(labelled, "kitti", labelled / "out")
     assert not (labelled / "out").exists()
+
+
+def test_flow_of_another_size(tmp_path: Path, message: Messages) -> None:
+    (tmp_path / "0001.flo").write_bytes(FLO)
+    with message.raises(ValueError, "0001.flo"):
+        read_flo(tmp_path / "0001.flo", (HEIGHT, WIDTH))

@@ -168,7 +168,7 @@ def test_rejection_of_a_contact_found_in_a_slack(device: Device, tmp_path: Path,
     assert result.model_rejected
     assert result.tests[0].contact < 0.61e-3
     (note,) = (note for note in result.notes if "slack.csv" in note)
-    message(note, "--contact", hide=r"\d[\d.]*")
+    message(result.summary(), "--contact", hide=r"-?\d[\d.e+-]*")
     contact = float(note.partition("a contact at ")[2].split()[0])
     assert contact == pytest.approx(1.6e-3, abs=0.1e-3)
     young = estimate(scene(), table, [YOUNG], contact=[contact]).parameters[YOUNG].value
@@ -238,10 +238,11 @@ def test_command_with_two_tables(pressed: str, tmp_path: Path, program: Program,
     start = scene(relaxation=[BRANCH], foundation={**FOUNDATION, "young": 1.5e4})
     (tmp_path / "scene.yaml").write_text(start.model_dump_json(exclude_none=True))
     options = ["--rate", str(RATE), "--contact", str(CONTACT), "--contact", "1.2e-3", "--window", "0,4", "--columns"]
-    free = ["--free", YOUNG, "--free", "contact.1", "--out", str(tmp_path / "out"), "--json", "--workers", "1"]
+    free = ["--free", YOUNG, "--free", "contact.1", "--out", str(tmp_path / "out"), "--workers", "1"]
     done = program("fit", str(tmp_path / "scene.yaml"), pressed, pressed, *free, *options, "depth=Depth")
     assert done.returncode == 0, done.stderr
-    record = json.loads(done.stdout)
+    message(done.stdout, "contact.1", hide=r"(?<!tact\.)-?\b\d[\d.e+-]*")
+    record = json.loads((tmp_path / "out/fit.json").read_text())
     assert [test["frames"] for test in record["tests"]] == [4 * RATE + 1] * 2
     assert record["parameters"][YOUNG]["value"] == pytest.approx(FOUNDATION["young"], rel=0.01)
     assert record["tests"][1]["contact"] == pytest.approx(CONTACT, abs=2e-5)

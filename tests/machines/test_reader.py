@@ -350,6 +350,11 @@ def add_chart_sheet(book: Any) -> None:
     book.create_chartsheet("Chart").add_chart(LineChart())
 
 
+def leave_a_chart(book: Any) -> None:
+    add_chart_sheet(book)
+    book.remove(book["FF2"])
+
+
 @pytest.fixture
 def save(tmp_path: Path) -> Callable[..., Path]:
     """Save a workbook of sheets by name, after a change."""
@@ -409,6 +414,7 @@ def put(cell: str, value: object) -> Callable[[Any], None]:
 SHEET_FAULTS: dict[str, tuple[list[list[Any]], Callable[[Any], object], list[str]]] = {
     "empty sheet": ([], lambda book: None, ["FF2", "empty"]),
     "several sheets without a table": ([], lambda book: book.create_sheet("FF3"), ["FF2, FF3"]),
+    "only a chart": ([], leave_a_chart, ["tests.xlsx"]),
     "merged names": (SHEET, lambda book: book["FF2"].merge_cells("B2:C2"), ["FF2!B2", "merged"]),
     "column of formulas": (
         [[*row[:2], f"=A{n}" if n > 3 else row[2], row[3]] for n, row in enumerate(SHEET, 1)],
@@ -430,6 +436,13 @@ def test_faults_of_a_sheet(name: str, save: Save, message: Messages) -> None:
     with message.raises(SceneError, *words) as caught:
         read_machine_test(save({"FF2": cells}, change))
     assert len(caught.value.lines) == 1
+
+
+def test_large_workbook(save: Save, monkeypatch: pytest.MonkeyPatch, message: Messages) -> None:
+    path = save({"FF2": SHEET})
+    monkeypatch.setattr("taichi_msm.machines.cells.MAX_UNPACKED_BYTES", 1000)
+    with message.raises(SceneError, "tests.xlsx", hide=r"\d+(?= MB)"):
+        read_machine_test(path)
 
 
 def test_openpyxl_is_not_installed(monkeypatch: pytest.MonkeyPatch, message: Messages) -> None:

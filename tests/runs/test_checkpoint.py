@@ -204,6 +204,13 @@ def test_parts_of_another_run(name: str, out: Path, tmp_path: Path) -> None:
         read(out)
 
 
+def test_frames_with_a_second_name(out: Path, message: Messages) -> None:
+    """Writing to them would change a file elsewhere."""
+    (out / "mine").hardlink_to(out / ".partial" / "checkpoint" / FRAMES_FILE)
+    with message.raises(FilesError, FRAMES_FILE):
+        read(out)
+
+
 def test_frame_that_is_not_a_number(out: Path) -> None:
     checkpoint = checkpoint_in(out)
     checkpoint.reopen()

@@ -167,6 +167,13 @@ def test_steering_a_fixed_tool(device: Device, message: Messages) -> None:
         np.testing.assert_array_equal(steered.positions(), expected.positions())
 
 
+def test_steering_between_force_and_total(device: Device, message: Messages) -> None:
+    """Only a total is smaller at an open edge."""
+    made = scene(sheet={**SHEET, "fixed": ["top"]})
+    with Simulation(made, threads=device.threads) as simulation, message.raises(ArgumentError, "restart"):
+        simulation.steer([{"total": [0, 0, -1], "load": PRESS["load"], "falloff": 20}])
+
+
 def test_restart(simulation: Simulation, device: Device, message: Messages) -> None:
     simulation.advance(3)
     simulation.restart()

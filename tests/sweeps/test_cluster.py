@@ -212,7 +212,7 @@ def test_unsuitable_workers_are_refused(
 ) -> None:
     result = program("sweep", "here/sweep.yaml", "--out", "far", "--dask", cluster(2))
     assert result.returncode == 2
-    message(result.stderr, "--nthreads 1", hide="about .* on disk|tcp://[^ ]*")
+    message(result.stderr, "--nthreads 1", hide=r"(?<=about ).*(?= if)|\d[\d.]*(?= MiB)|tcp://[^ ]*")
     worker = SimpleNamespace(address="tcp://far", state=SimpleNamespace(nthreads=1), local_directory=str(lab))
     inputs = Inputs(load_sweep("here/sweep.yaml"), lab / "out")
     with message.raises(MsmError, "tcp://far", "--out"):

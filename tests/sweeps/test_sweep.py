@@ -141,6 +141,13 @@ def test_sweep_resumes_with_missing_runs(many: Path, pool: Pool, whole: Path) ->
     assert (second / "run.json").read_bytes() == record, "the run was repeated"
 
 
+def test_command_of_a_finished_sweep(many: Path, whole: Path, program: Program, message: Messages) -> None:
+    shutil.copytree(whole, "out")
+    done = program("sweep", "many.yaml", "--out", "out")
+    message(done.stderr.splitlines()[0], "2 of 4")
+    assert table("out") == table(whole)
+
+
 def test_shards_change_nothing(many: Path, pool: Pool, whole: Path) -> None:
     for part in (2, 1, 3):
         execute_sweep(pool, "parts", (part, 3))
@@ -389,6 +396,9 @@ def test_pool_replaces_a_killed_process(message: Messages) -> None:
     pool.shutdown(cancel_futures=True)
     assert waiting[2].cancelled()
     assert time.monotonic() - start < 20, "it waited for a call"
+    # As a thread does that took its call before the end.
+    with message.raises(DiedError):
+        pool._call(os.getpid)
 
 
 def test_processes_of_a_pool_end_with_their_parent(tmp_path: Path) -> None:

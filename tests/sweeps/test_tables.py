@@ -12,6 +12,7 @@ from concurrent.futures import Executor, ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -21,6 +22,7 @@ from scipy.stats import qmc
 from taichi_msm import sweep
 from taichi_msm.errors import ForeignError
 from taichi_msm.plot_style import STYLE
+from taichi_msm.sweeps import plots
 from taichi_msm.sweeps.plots import (
     abbreviate_keys,
     estimate_sensitivity,
@@ -135,7 +137,7 @@ def test_sensitivity_needs_64_complete_runs(make: Make) -> None:
     assert shares == pytest.approx([1, 0, 0], abs=0.1)
 
 
-def test_contact_sheet(make: Make, ran: Path, message: Messages) -> None:
+def test_contact_sheet(make: Make, ran: Path, monkeypatch: pytest.MonkeyPatch, message: Messages) -> None:
     result = make()
     copy_runs(ran, result)
     names, notes = write(result)
@@ -158,8 +160,11 @@ def test_contact_sheet(make: Make, ran: Path, message: Messages) -> None:
     assert 0.97 < (np.abs(tiles[3] - 0xE6) <= 2).all(axis=2).mean() < 1
     damaged = result.run_directory(1) / "frames" / "0002.png"
     damaged.write_bytes(damaged.read_bytes()[:100])
+    drawing = Mock(wraps=plots._draw_tiles)
+    monkeypatch.setattr(plots, "_draw_tiles", drawing)
     names, notes = write(result)
     assert "contact.jpg" in names
+    message(drawing.call_args.args[-1], "8 runs")
     message(notes, "contact.jpg", "0002.png", hide=r"(?<=decoded).*")
 
 

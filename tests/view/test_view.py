@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import signal
 from itertools import islice
 from pathlib import Path
 
@@ -12,9 +13,11 @@ from PIL import Image
 from taichi_msm import load_scene
 from taichi_msm.cli.main import main
 from taichi_msm.errors import SceneError
+from taichi_msm.runs.media import Picture
 from taichi_msm.view.events import Drag, Key, Press, Release, Strength, Turn
 from taichi_msm.view.script import load_script, schedule_events
 from taichi_msm.view.server import MAX_DELAY_S, Pacing
+from taichi_msm.view.session import Session
 from tests.conftest import Program
 from tests.golden import Messages
 from tests.outputs import duration
@@ -139,6 +142,22 @@ def test_unwritable_film(small: Path, program: Program, message: Messages) -> No
         done = program("view", "small.yaml", "--record", film, "--seconds", "1")
         assert done.returncode == 4
         message(done.stderr, film.split("/")[0], "--record")
+
+
+def test_interruption_of_a_film(
+    small: Path, program: Program, monkeypatch: pytest.MonkeyPatch, message: Messages
+) -> None:
+    draw = Session.picture
+
+    def interrupt(session: Session) -> Picture:
+        signal.raise_signal(signal.SIGINT)
+        return draw(session)
+
+    monkeypatch.setattr(Session, "picture", interrupt)
+    done = program("view", "small.yaml", "--record", "live.gif", "--seconds", "1")
+    assert done.returncode == 130
+    message(done.stderr, "interrupted")
+    assert not Path("live.gif").exists()
 
 
 FAILING = """\
