@@ -114,12 +114,6 @@ def test_invalid_options_of_fits(free: list[str], options: dict[str, object], me
         fit(made, observed, free, workers=1, **options)  # type: ignore[arg-type]
 
 
-# Message of GPUs that end threads early; a slow test provokes it on some drivers.
-NOT_PROVOKED = {
-    ": the device left out part of the work (",
-    "pieces), so pictures and labels would be wrong; take --arch cpu",
-}
-
 # Modules whose texts are help, labels of plots and contents of files, and calls and names with such texts.
 WITHOUT_MESSAGES = {
     "__init__.py",
@@ -171,7 +165,7 @@ def test_every_message_is_provoked(root: Path) -> None:
         for file in package.rglob("*.py")
         if str(file.relative_to(package)) not in WITHOUT_MESSAGES
         for text in prose_of(file)
-        if text not in golden and text not in NOT_PROVOKED
+        if text not in golden
     }
     assert not missing
 
