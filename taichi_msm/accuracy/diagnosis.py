@@ -47,7 +47,7 @@ def diagnose(dynamics: SheetSolver[Any], start: Snapshot | None, pause: Pause) -
     """
     plan, grid, bad_step = dynamics.plan, dynamics.plan.grid, dynamics.steps_done
     recorder = ForceRecorder(plan)
-    state, progress, forces = (None, RunProgress(), recorder.at_rest()) if start is None else start[:3]
+    state, progress, forces = (None, RunProgress(), recorder.at_start()) if start is None else start[:3]
     monitor = DivergenceMonitor(plan, progress)
     dynamics.restart(plan, state)
     sound, fault = dynamics.state(), ""
@@ -59,7 +59,7 @@ def diagnose(dynamics: SheetSolver[Any], start: Snapshot | None, pause: Pause) -
             break
         if monitor.progress.frame * grid.steps_per_frame == reading.steps:
             position = to_positions(reading.displacement, plan.scene.sheet)
-            forces = recorder.follow(forces, monitor.progress.frame, position, dynamics.tool_forces())
+            forces = recorder.at_frame(forces, monitor.progress.frame, position, dynamics.tool_forces())
         sound = dynamics.state()
     if not fault:
         reason = "but not when it was repeated, so the machine has made an error; continue with --resume"

@@ -49,7 +49,7 @@ from taichi_msm.scene.section import MAX_POINTS
 from taichi_msm.scene.sheet import Sheet
 from taichi_msm.scene.tools import Probe
 from taichi_msm.solver.planning import choose_precision, plan_variant, stable_steps
-from taichi_msm.solver.rest import build_dynamics
+from taichi_msm.solver.rest import build_solver
 from taichi_msm.system.runtime import Device
 
 # Order p of the mesh error with position-controlled tools.
@@ -178,7 +178,7 @@ class MeshCompanion:
             min_steps = math.ceil(plan.grid.steps_per_frame / 2) if plan.has_contact else 1
             steps = 1 if plan.scene.time.at_rest else max(math.ceil(steps / 2), stable_steps(companion), min_steps)
             in_f64 = companion.with_grid(precision="f64", steps_per_frame=steps)
-            self._sheets.append(build_dynamics(in_f64, device, cores=cores))
+            self._sheets.append(build_solver(in_f64, device, cores=cores))
         points = zip(plan.scene.sheet.points, coarse.scene.sheet.points, strict=True)
         self._ratio = min((count - 1) / (fewer - 1) for count, fewer in points)
         self._differences = [0.0 for _ in plans]
@@ -364,7 +364,7 @@ def estimate_mesh_error(plan: Plan, device: Device, progress: ProgressCallback) 
     first = MeshCompanion(in_f64, coarse, device)
     companion: MeshCompanion | None = first
     while companion is not None:
-        dynamics = build_dynamics(in_f64, device)
+        dynamics = build_solver(in_f64, device)
         for frame in range(grid.frames):
             pause = partial(progress, frame, grid.frames)
             pause()

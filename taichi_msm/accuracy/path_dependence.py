@@ -25,7 +25,7 @@ from taichi_msm.model.plan import Plan
 from taichi_msm.model.tools import grip_frames
 from taichi_msm.scene.tools import Probe
 from taichi_msm.solver.planning import affords_companions, plan_variant
-from taichi_msm.solver.rest import build_dynamics
+from taichi_msm.solver.rest import build_solver
 from taichi_msm.system.runtime import Device
 from taichi_msm.terms import build_terms
 
@@ -153,7 +153,7 @@ def second_solution(plan: Plan, frame: int, device: Device, cores: int | None, p
         return None
     probes = tuple(_load_at_once(plan, probe, frame) for probe in scene.probes)
     time = scene.time.model_copy(update={"duration": 1.0, "frames_per_second": 1})
-    sheet = build_dynamics(
+    sheet = build_solver(
         plan_variant(plan, scene.model_copy(update={"probes": probes, "time": time})), device, cores=cores
     )
     try:

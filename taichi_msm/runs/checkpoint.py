@@ -290,8 +290,8 @@ class Checkpoint:
         scene, grid, zero = self._plan.scene, self._plan.grid, (0.0, 0.0, 0.0)
         position = np.empty((*scene.sheet.points, 3), self.precision)
         memory = np.empty((len(memory_names(self._plan)), *scene.sheet.points), self.precision)
-        felt = ProbeForces((TipForce(0, zero, zero),) * len(scene.probes), (PeakForce(0, zero),) * len(scene.probes))
-        expected = _state_arrays(Snapshot(State(0, position, position, memory), RunProgress(), felt))
+        forces = ProbeForces((TipForce(0, zero, zero),) * len(scene.probes), (PeakForce(0, zero),) * len(scene.probes))
+        expected = _state_arrays(Snapshot(State(0, position, position, memory), RunProgress(), forces))
         try:
             with self._state_path.open("rb") as file, zipfile.ZipFile(file) as archive:
                 self._manifest = _manifest_bytes(archive)
@@ -348,9 +348,14 @@ class Checkpoint:
 
 def _state_arrays(saved: Snapshot) -> dict[str, NDArray[Any]]:
     """Convert a state and its progress to arrays by name."""
-    greatest = np.array([(peak.time, *peak.force) for peak in saved.felt.greatest]).reshape(-1, PEAK_FORCE_COLUMNS)
-    forces = {"forces": _tip_force_array(saved.felt.forces), "greatest": greatest}
-    named = {**saved.state._asdict(), **asdict(saved.progress), **forces}
+    forces, peaks = saved.probe_forces
+    greatest = np.array([(peak.time, *peak.force) for peak in peaks]).reshape(-1, PEAK_FORCE_COLUMNS)
+    named = {
+        **saved.state._asdict(),
+        **asdict(saved.progress),
+        "forces": _tip_force_array(forces),
+        "greatest": greatest,
+    }
     return {name: np.asarray(value) for name, value in named.items()}
 
 

@@ -58,7 +58,7 @@ def _build_sum(config: KernelConfig) -> Callable[..., None]:
             fields: as in `SheetArrays`.
             sums: output [m], shape (tools x 3, rows).
         """
-        share_of, corrections = ti.static(by_column, fields)
+        area_shares, corrections = ti.static(by_column, fields)
         ti.loop_config(serialize=serial)
         for i in range(rows):
             strip, kind = (cols + lanes - 1) // lanes, ti.select(i == rows - 1, 2, ti.select(i == 0, 0, 1))
@@ -71,10 +71,10 @@ def _build_sum(config: KernelConfig) -> Callable[..., None]:
                 if largest.max() > 0:
                     for lane in ti.static(range(lanes)):
                         for b in range(1, strip + 1):
-                            share = ti.cast(1, ti.f64)
+                            area_share = ti.cast(1, ti.f64)
                             if ti.static(by_area):
-                                share = ti.cast(share_of[(AREA_SHARE + kind) * (strip + 2) + b][lane], ti.f64)
-                            total += share * ti.cast(corrections[row + b][lane], ti.f64)
+                                area_share = ti.cast(area_shares[(AREA_SHARE + kind) * (strip + 2) + b][lane], ti.f64)
+                            total += area_share * ti.cast(corrections[row + b][lane], ti.f64)
                     if clear:
                         for b in range(1, strip + 1):
                             corrections[row + b] = vector(0)
