@@ -11,9 +11,9 @@ import math
 from typing import NamedTuple
 
 from taichi_msm.model.plan import Plan
-from taichi_msm.solver.planning import affords_companions, stable_steps
+from taichi_msm.solver.planning import affords_companions, min_stable_steps
 
-# An error below this share of the largest displacement needs no fine companion run.
+# A smaller error, as a fraction of the largest displacement, needs no fine companion run.
 NEGLIGIBLE_ERROR = 1e-3
 
 # Largest number of steps of a fine companion run, as a multiple of the run's. The error is unknown if the damping
@@ -25,7 +25,7 @@ MAX_STEP_RATIO = 64
 # the cells per side and 1/2 of the steps.
 MESH_COST, CONTACT_MESH_COST = 1 / 4 / 2 + 1 / 16 / 4, 1 / 2 / 2
 
-# Reason for the missing time-step error of a quasi-static scene.
+# Reason for a missing estimate in a quasi-static scene, which has no time step.
 QUASISTATIC_REASON = "quasistatic"
 
 
@@ -81,18 +81,16 @@ def choose_companion_runs(plan: Plan, *, requested: bool = False) -> CompanionRu
 def coarse_steps(plan: Plan) -> int:
     """Return the steps per frame of the coarse companion run, half of the run's; 0 if unstable or too expensive."""
     run_steps = plan.grid.steps_per_frame
-    steps = max(math.ceil(run_steps / 2), stable_steps(plan))
+    steps = max(math.ceil(run_steps / 2), min_stable_steps(plan))
     # A companion run with more than 0.6 of the run's steps saves too little.
     return steps if steps <= 0.6 * run_steps else 0
 
 
 def fine_steps(plan: Plan) -> int:
-    """Return the steps per frame of the fine companion run: r times the run's, with r = 2, or more in strong damping.
+    """Return the steps per frame of the fine companion run, r times the run's; 0 if r > `MAX_STEP_RATIO` is required.
 
-    r >= g h, with g = C / m. With a smaller r, central differences reverse velocities at every step, and the difference
-    between runs with steps h and h / r underestimates the error. A coarse companion run overestimates it 2 to 4 times.
-
-    The result is 0 if the damping requires r > `MAX_STEP_RATIO`.
+    r is 2, or with strong damping at least g h, with g = C / m. With a smaller r, central differences would reverse the
+    velocities at every step, and the two runs would differ by less than the error.
     """
     refinement = max(2, math.ceil(plan.material.drag * plan.grid.step))
     return refinement * plan.grid.steps_per_frame if refinement <= MAX_STEP_RATIO else 0

@@ -50,8 +50,8 @@ class PathDependence:
             for probe in plan.scene.probes
             if not probe.moved
         ]
-        # Number and displacements of three frames: the previous one, the one with the largest displacement, and the
-        # first one after that with less than half of it.
+        # Frames, as a pair of number and displacements: the previous one, the one with the largest displacement, and
+        # the first one after that with less than half of it.
         self._previous: tuple[int, Array] | None = None
         self._largest, self._most_displaced = 0.0, (0, np.zeros(()))
         self._unloaded: tuple[int, Array] | None = None
@@ -97,7 +97,7 @@ class PathDependence:
 
     def affords(self, companion_cost: float) -> bool:
         """Return whether second solutions and companion runs of a given cost together cost a small part of the run."""
-        # There are three second solutions. Each costs about three frames of the run, because it begins at rest.
+        # Each of the three second solutions begins at rest, and therefore costs about as much as three frames.
         second_cost = 3 * 3 / (self._plan.grid.frames + 1)
         return affords_companions(self._plan, companion_cost + second_cost)
 

@@ -41,15 +41,16 @@ from taichi_msm.system.runtime import Device
 # contact (docs/decisions/0027).
 FORCE_ERROR_FACTOR = 1.15
 
-# Lower bound of the relative error of a tool's force, as a multiple of the mesh error of the displacement, for grips
-# with equal forces in both runs by chance. The upper bound is the error of the displacement (docs/decisions/0027).
-MIN_MESH_ERROR_SHARE = 0.5
+# Smallest relative error of a tool's force, as a multiple of the mesh error of the displacement, because the forces of
+# both runs may be equal by chance in a grip. The largest one, with contact, is the error of the displacement
+# (docs/decisions/0027).
+MIN_FORCE_ERROR_FACTOR = 0.5
 
 # Smallest ratio of a spring's length to its rest length for which the stability limit holds, see
 # `SpringTerm.stiffness_bound`.
 MIN_SPRING_RATIO = 0.5
 
-# Smallest error for which a remedy is suggested, as a share of the largest displacement.
+# Smallest error for which a remedy is suggested, relative to the largest displacement.
 REMEDY_THRESHOLD = 0.01
 
 
@@ -98,7 +99,7 @@ class RunErrorEstimator:
         reference = plan.with_grid(steps_per_frame=steps) if self._mesh_follows_coarse else plan
         self._mesh = None if coarse is None else MeshCompanion(reference, coarse, device, cores)
         self._squared_errors, self._contact_frames, self._max_force = np.zeros((3, len(plan.tools)))
-        self._all_forces = True
+        self._has_all_forces = True  # whether the forces of all frames so far are known
 
     def compile(self) -> None:
         """Compile the kernels before the first frame."""
@@ -123,7 +124,7 @@ class RunErrorEstimator:
             coarse = self._time_step if self._mesh_follows_coarse else None
             self._mesh.compare_frame(coarse.displacement if coarse else displacement, pause)
         if forces is None:
-            self._all_forces = False
+            self._has_all_forces = False
         elif self._plan.tools and self._mesh is not None:
             coarse_forces = self._mesh.tool_forces()
             error = FORCE_ERROR_FACTOR * np.abs(forces - coarse_forces)
@@ -177,7 +178,7 @@ class RunErrorEstimator:
         if self._mesh is not None:
             known = known._replace(mesh=self._mesh.estimate)
             in_contact = self._max_force[[not isinstance(tool, Clamp) for tool in self._plan.tools]].all()
-            if self._all_forces and not in_contact:
+            if self._has_all_forces and not in_contact:
                 known = known._replace(mesh=MeshEstimate(math.inf, NO_CONTACT))
             elif self._plan.has_contact and known.time_step is not None and known.time_step.error > MAX_DIFFERENCE:
                 known = known._replace(mesh=MeshEstimate(math.inf, LARGE_STEP_ERROR))
@@ -187,7 +188,7 @@ class RunErrorEstimator:
         mesh = known.mesh
         if self._mesh is None or mesh is None:
             return ForceEstimate(None, "there is no run with fewer points")
-        if not self._all_forces:
+        if not self._has_all_forces:
             return ForceEstimate(None, "the forces of the frames before the run was continued are not kept")
         if mesh.error == math.inf:
             return ForceEstimate(None, mesh.doubt)
@@ -197,7 +198,7 @@ class RunErrorEstimator:
         relative = float(root_mean_square / self._max_force.max())
         if relative > FORCE_ERROR_FACTOR * MAX_DIFFERENCE:
             return ForceEstimate(None, NOT_CONVERGED)
-        relative = max(relative, MIN_MESH_ERROR_SHARE * mesh.error)
+        relative = max(relative, MIN_FORCE_ERROR_FACTOR * mesh.error)
         if not self._plan.has_contact:
             return ForceEstimate(relative)
         displacement_error = max(mesh.error, known.time_step.error if known.time_step is not None else 0.0)
@@ -219,22 +220,23 @@ def run_warnings(
         probes: records of the probes' forces.
         progress: progress of the run.
         errors: estimated errors of the run.
-        affords: function from a plan to whether it runs within an hour.
+        affords: function that returns whether a plan runs within an hour.
         scale: pixels per metre at the middle of the sheet; None without a picture.
 
     Yields:
         A line of text per estimate or warning.
     """
     scene, grid = plan.scene, plan.grid
-    estimate, reason, mesh, force = errors
-    if estimate is not None or mesh is not None:
-        yield _error_line(estimate, mesh, progress.max_displacement, scale) + (
+    time_step, reason, mesh, force = errors
+    if time_step is not None or mesh is not None:
+        yield _error_line(time_step, mesh, progress.max_displacement, scale) + (
             "; mesh error unknown: another number of points is another sheet" if scene.tissue is None else ""
         )
-    if estimate is not None:
-        if REMEDY_THRESHOLD < estimate.error < math.inf:
-            source = "the time step" if not estimate.separate or estimate.in_f64 > REMEDY_THRESHOLD / 2 else "rounding"
-            yield f"for a smaller error of {source}, {_step_remedy(plan, estimate, affords)}"
+    if time_step is not None:
+        if REMEDY_THRESHOLD < time_step.error < math.inf:
+            of_step = not time_step.separate or time_step.in_f64 > REMEDY_THRESHOLD / 2
+            source = "the time step" if of_step else "rounding"
+            yield f"for a smaller error of {source}, {_step_remedy(plan, time_step, affords)}"
     elif reason == QUASISTATIC_REASON:
         yield "error: no time step in a quasi-static scene"
     elif reason:
@@ -298,13 +300,15 @@ def _error_line(
         errors.append(estimate.error)
     if mesh is not None and mesh.error < math.inf:
         parts.append(f"mesh {_bound_words(mesh.at_most, bool(mesh.doubt))}{_percent(mesh.error, 2)} %")
-    of = ""
+    size = ""
     if errors:
         distance = max(errors) * max_displacement
         pixels = f", {_digits(distance * scale)} px" if scale is not None else ""
-        of = f" of {_digits(1000 * max_displacement, 2)} mm ({_digits(1000 * distance)} mm{pixels})"
-    unknown = f"; mesh error not known: {mesh.doubt}" if mesh is not None and mesh.error == math.inf else ""
-    return f"error: {', '.join(parts)}{of}{unknown}" if parts else f"error{unknown}".replace("error; ", "")
+        size = f" of {_digits(1000 * max_displacement, 2)} mm ({_digits(1000 * distance)} mm{pixels})"
+    sentences = [f"error: {', '.join(parts)}{size}"] if parts else []
+    if mesh is not None and mesh.error == math.inf:
+        sentences.append(f"mesh error not known: {mesh.doubt}")
+    return "; ".join(sentences)
 
 
 def _bound_words(at_most: bool, at_least: bool) -> str:
@@ -312,8 +316,8 @@ def _bound_words(at_most: bool, at_least: bool) -> str:
     return ("roughly " if at_least else "at most about ") if at_most else "at least " if at_least else ""
 
 
-def _percent(share: float, digits: int) -> str:
-    return _digits(100 * share, digits)
+def _percent(fraction: float, digits: int) -> str:
+    return _digits(100 * fraction, digits)
 
 
 def _digits(number: float, digits: int = 1) -> str:

@@ -35,7 +35,7 @@ class Schedule(NamedTuple):
     slots: tuple[ProbeSlot, ...]  # the second axis of `strength` and `point`
     strength: Array  # force without decay [N], shape (steps, slots, 3)
     point: Array  # control point, x and y at rest [m], shape (steps, slots, 2)
-    active: Array  # active share of the virtual springs' stiffness, 0 to 1, shape (steps,)
+    active: Array  # factor of the virtual springs' stiffness, 0 to 1, shape (steps,)
 
 
 def decay(probe: Probe, sheet: Sheet, at: Array | None = None) -> Array:
@@ -241,7 +241,7 @@ class _PiecewiseLinear:
         # Limits from the left and from the right at every keyframe.
         before, after = values[times.searchsorted(keys, "left")], values[times.searchsorted(keys, "right") - 1]
         before[0] = 0.0
-        # Redundant keyframes are dropped, because they would change the rounding.
+        # Drop redundant keyframes, because they would change the rounding.
         last, following = np.append(0.0, after[:-1]), np.append(before[1:], after[-1])
         needed = (last != before) | (before != after) | (after != following)
         needed[0] = True
@@ -279,9 +279,9 @@ class _PiecewiseLinear:
         """Evaluate the function between the keyframes after[n] - 1 and after[n]."""
         low, high = np.maximum(after - 1, 0), np.minimum(after, len(self.times) - 1)
         span = self.times[high] - self.times[low]
-        share = np.divide(t - self.times[low], span, out=np.zeros_like(t), where=span > 0)
+        fraction = np.divide(t - self.times[low], span, out=np.zeros_like(t), where=span > 0)
         slope = np.where(span > 0, self.before[high] - self.after[low], 0.0)
-        return np.where(after == 0, 0.0, self.after[low] + share * slope)
+        return np.where(after == 0, 0.0, self.after[low] + fraction * slope)
 
     def _average(self, t: float, h: float, begin: float, end: float) -> float:
         """Return the average about a time, by Simpson's rule on each piece; exact for products of linear functions."""
@@ -327,7 +327,7 @@ def _load(probe: Probe) -> _PiecewiseLinear:
 
 
 def _pressing_keys(probe: Probe) -> Sequence[tuple[float, float]]:
-    """Return keyframes of a function that is nonzero while a probe acts: its load, or 1 along its path."""
+    """Return the keyframes of a function that is not 0 while a probe acts: its load, or 1 along its path."""
     if probe.path is None:
         return probe.load
     begin, end = probe.path[0][0], probe.path[-1][0]

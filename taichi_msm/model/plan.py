@@ -43,7 +43,7 @@ class ProbeSlot:
     probe: int  # index of the probe in the scene
     segments: tuple[ProbeSegment, ...]  # all segments of the control point, including those of other slots
     first_segment: int  # index of the slot's first segment
-    slot_count: int  # number of slots of the probe; the slot has the segments first_segment + n slot_count, n >= 0
+    slot_count: int  # number of slots of the probe; every slot_count-th segment from the first belongs to the slot
 
     @property
     def moves(self) -> bool:

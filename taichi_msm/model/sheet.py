@@ -75,7 +75,7 @@ def fixed_sides(sheet: Sheet) -> tuple[Side, ...]:
 
 
 def _held_points(scene: Scene, fixed: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """Return whether each mass point is fixed or clamped, both of shape (rows, cols)."""
+    """Return whether each mass point is fixed or clamped, shape (rows, cols), for the given fixed ones."""
     held = fixed.copy()
     for probe in scene.probes:
         if probe.clamp is not None:
@@ -99,11 +99,6 @@ class LockNumbers(NamedTuple):
 
     lock: float  # elongation m at which the law locks: strain of a spring, or depth of the foundation [m]
     factor: float  # largest tangent stiffness, relative to the initial one
-
-    @property
-    def steepest(self) -> float:
-        """Largest tangent stiffness, relative to the initial one, for the stability limit."""
-        return self.factor
 
 
 @dataclass(frozen=True, eq=False)

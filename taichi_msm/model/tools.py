@@ -28,8 +28,8 @@ from taichi_msm.scene.tools import Probe
 from taichi_msm.shapes import SHAPES
 from taichi_msm.shapes.shape import Shape
 
-# Largest displacement of a rough tool between two equilibria, in its radii. Its force depends on the place of its first
-# contact with each mass point.
+# Largest displacement of a rough tool between two equilibria, in radii of the tool. It limits the error of the places
+# where mass points stick, on which the tool's force depends.
 ROUGH_STRIDE_RADII = 1 / 16
 
 # Largest spacing of mass points without a warning, in radii of the tool; a larger one makes the contact force uneven.
@@ -59,7 +59,7 @@ class Tool:
     shape: Shape
     friction: float  # Coulomb's coefficient; infinite if rough
     grips: tuple[tuple[float, float], ...]  # start and end of every grip [s]
-    stride_limit: float  # largest allowed displacement between two equilibria, or (except a clamp's) in a step [m]
+    stride_limit: float  # largest displacement between two equilibria, or in a step (there not of a clamp) [m]
 
     @property
     def rough(self) -> bool:
@@ -233,7 +233,7 @@ def path_problems(scene: Scene, tools: Sequence[Tool], grid: TimeGrid) -> Iterat
             yield Problem(key, text)
         if problem := friction_problem(tool, at_rest=scene.time.at_rest):
             yield Problem(("probes", tool.probe, "friction"), problem)
-        if not scene.time.at_rest and (fault := too_fast(tool, grid)):
+        if not scene.time.at_rest and (fault := speed_problem(tool, grid)):
             yield Problem((*key, fault[0]), fault[1])
 
 
@@ -263,8 +263,8 @@ def _clamp_problems(clamp: Clamp, scene: Scene) -> Iterator[Problem]:
         yield Problem((*key, "path", 0), text)
 
 
-def too_fast(tool: Tool, grid: TimeGrid, first: int = 0) -> tuple[int, str] | None:
-    """Return the keyframe at the end of the fastest segment, and a message about its speed.
+def speed_problem(tool: Tool, grid: TimeGrid, first: int = 0) -> tuple[int, str] | None:
+    """Return the index of the keyframe after the fastest segment, and a message about the speed.
 
     The result is None for a tool that is slow enough for the time step, and for a clamp.
 

@@ -456,7 +456,7 @@ class SpringTerm(Term):
 
 def _unmapped_bound(material: Material) -> float:
     across, down, shear = material.across, material.down, material.shear
-    steepest = 1.0 if material.stiffening is None else material.stiffening.steepest
+    steepest = 1.0 if material.stiffening is None else material.stiffening.factor
     return steepest * 4 * max(across + down, across + 2 * shear, down + 2 * shear)
 
 
