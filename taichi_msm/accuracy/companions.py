@@ -2,7 +2,7 @@
 
 A companion run repeats the scene with another time step or another mesh, in parallel to the run. A coarse one, with
 half the steps, costs half a run; a fine one, with twice the steps, costs two. Hence the first companion run is coarse
-if twice the step is stable, and a fine one follows only after an error that is not negligible.
+if twice the step is stable, and a fine one follows only after an error above NEGLIGIBLE_ERROR.
 """
 
 from __future__ import annotations

@@ -171,7 +171,7 @@ class RunErrorEstimator:
         known = self._known
         if known.time_step is None and self._time_step is not None:
             estimate = self._time_step.estimate
-            # After a coarse companion run the error may be larger; of a run in f32 the estimate is an upper bound.
+            # After a coarse companion run the error may be larger; in f32 the estimate is already an upper bound.
             if self._coarse and estimate.separate and NEGLIGIBLE_ERROR <= estimate.error < math.inf:
                 estimate = replace(estimate, at_least=True)
             known = known._replace(time_step=estimate)
@@ -290,7 +290,7 @@ def _error_line(
     """Format the estimated errors of a run; for the arguments see `run_warnings`."""
     if estimate is not None and estimate.error == math.inf:
         return "error not known: a companion run diverged, or steps do not resolve the damping"
-    parts, errors = [], [mesh.error] if mesh is not None and mesh.error < math.inf else []
+    parts, errors, sentences = [], [], []
     if estimate is not None:
         bound = _bound_words(estimate.at_most or not estimate.separate, estimate.at_least)
         name = "time step" if estimate.separate else "time step and rounding"
@@ -300,12 +300,12 @@ def _error_line(
         errors.append(estimate.error)
     if mesh is not None and mesh.error < math.inf:
         parts.append(f"mesh {_bound_words(mesh.at_most, bool(mesh.doubt))}{_percent(mesh.error, 2)} %")
-    size = ""
+        errors.append(mesh.error)
     if errors:
         distance = max(errors) * max_displacement
         pixels = f", {_digits(distance * scale)} px" if scale is not None else ""
-        size = f" of {_digits(1000 * max_displacement, 2)} mm ({_digits(1000 * distance)} mm{pixels})"
-    sentences = [f"error: {', '.join(parts)}{size}"] if parts else []
+        size = f"{_digits(1000 * max_displacement, 2)} mm ({_digits(1000 * distance)} mm{pixels})"
+        sentences.append(f"error: {', '.join(parts)} of {size}")
     if mesh is not None and mesh.error == math.inf:
         sentences.append(f"mesh error not known: {mesh.doubt}")
     return "; ".join(sentences)

@@ -121,13 +121,13 @@ class Surface(NamedTuple):
 
 
 class Solid(NamedTuple):
-    """An instrument at a time: its shape and position."""
+    """The shape and position of an instrument at a time."""
 
     tip: Array  # end of the axis at the sheet [m], shape (3,)
     axis: Array  # unit vector from the tip along the shaft, shape (3,)
     length: float  # of the axis [m]
     radius: float  # of the shape [m]
-    shape: Shape = SHAPES["capsule"]
+    shape: Shape
 
 
 def refine_surface(position: NDArray[np.floating], refine: int) -> Surface:

@@ -256,7 +256,7 @@ def _clamp_problems(clamp: Clamp, scene: Scene) -> Iterator[Problem]:
     if clamp.side in fixed_sides(scene.sheet):
         yield Problem((*key, "clamp"), f"{clamp.side} is in sheet.fixed; remove it there, or clamp another side")
     elif not clamp.points.any():
-        text = f"{clamp.side} has no mass point that is neither fixed nor held by a clamp before it; remove one of them"
+        text = f"every mass point of {clamp.side} is fixed or held by an earlier clamp; remove one of them"
         yield Problem((*key, "clamp"), text)
     if any(begin):
         text = f"is {begin}; a clamp begins at rest at 0 s, so put [0, 0, 0, 0] first"
@@ -282,22 +282,22 @@ def speed_problem(tool: Tool, grid: TimeGrid, first: int = 0) -> tuple[int, str]
     )
 
 
-def min_steps_per_frame(tools: Sequence[Tool], grid: TimeGrid, least: int) -> int:
+def min_steps_per_frame(tools: Sequence[Tool], grid: TimeGrid, min_steps: int) -> int:
     """Return the smallest number of steps per frame with which no tool is too fast.
 
     Args:
         tools: position-controlled tools.
         grid: supplies the frame rate.
-        least: lower bound of the number.
+        min_steps: lower bound of the number.
     """
 
     def speed_ratio(tool: Tool) -> float:
-        return tool.max_stride(1 / grid.frames_per_second / least)[0] / tool.stride_limit
+        return tool.max_stride(1 / grid.frames_per_second / min_steps)[0] / tool.stride_limit
 
     # With n times the steps, the largest displacement in a step is 1 / n of the previous one or more, so repeat.
     while (ratio := max(map(speed_ratio, touching_tools(tools)), default=0.0)) > 1 + 1e-9:
-        least = max(least + 1, math.ceil(least * ratio * (1 - 1e-9)))
-    return least
+        min_steps = max(min_steps + 1, math.ceil(min_steps * ratio * (1 - 1e-9)))
+    return min_steps
 
 
 def path_warnings(scene: Scene, tools: Sequence[Tool]) -> Iterator[str]:

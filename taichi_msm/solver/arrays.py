@@ -147,20 +147,10 @@ class SheetArrays:
         for c in range(3):
             self._set(self.u[c], np.where(has_row, displacement[self._sheet_rows, :, c], 0))
 
-    def get_fields(self, first: int, count: int) -> NDArray[Any]:
-        """Read consecutive fields of the terms.
-
-        Args:
-            first: index of the first field.
-            count: number of fields.
-
-        Returns:
-            Fields, shape (count, rows, cols).
-        """
+    def get_field(self, index: int) -> NDArray[Any]:
+        """Read a field of a term, shape (rows, cols)."""
         layout = self._layout
-        entries = self.fields.to_numpy()[first * layout.rows * layout.width :]
-        values = from_lanes(layout, entries, count * layout.rows)
-        return np.ascontiguousarray(values.reshape(count, layout.rows, layout.cols))
+        return from_lanes(layout, self.fields.to_numpy()[index * layout.rows * layout.width :], layout.rows)
 
     def set_fields(self, first: int, values: NDArray[Any]) -> None:
         """Replace consecutive fields of the terms.

@@ -130,7 +130,7 @@ def build_step_row(
 
     @ti.func
     def publish(sheet: ti.template(), band: ti.template(), border, i, inward, n):
-        """Copy row i, and with bending the next row inward, for the neighbour at a border, n steps after the start."""
+        """Copy row i after n steps, and with bending the next row inward, for the neighbour at a border."""
         for behind in ti.static(range(copied)):
             copy = copy_at(band.rows, band.worker, border, n, behind)
             for b in range(sheet.width):

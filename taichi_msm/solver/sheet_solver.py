@@ -229,10 +229,12 @@ class SheetSolver(ABC, Generic[Kernel]):
 
     def _read_memory(self) -> NDArray[Any]:
         """Read the numbers that terms remember, shape (numbers, rows, cols)."""
-        fields = [self.kernel.arrays.get_fields(n, 1) for n in self.layout.config.memory_fields]
-        # The memory of fixed mass points has no effect, and only some kernels change it.
-        fields = [np.where(self.plan.fixed, 0, field).astype(self._dtype) for field in fields]
-        return np.concatenate([np.empty((0, self.layout.rows, self.layout.cols), self._dtype), *fields])
+        indices = self.layout.config.memory_fields
+        memory = np.empty((len(indices), self.layout.rows, self.layout.cols), self._dtype)
+        for field, index in zip(memory, indices, strict=True):
+            # The memory of fixed mass points has no effect, and only some kernels change it.
+            field[:] = np.where(self.plan.fixed, 0, self.kernel.arrays.get_field(index))
+        return memory
 
 
 def _initial_data(plan: Plan, layout: SheetLayout, state: State | None) -> InitialData:
