@@ -16,8 +16,8 @@ from taichi_msm.terms import TERMS
 from taichi_msm.terms.foundation import FoundationTerm, foundation_energy, point_shares
 from taichi_msm.terms.loads import force_norm, max_free_acceleration
 
-# Factor by which the energy may exceed the energy supplied by the loads. The energy of Verlet's method oscillates by
-# 1 / (1 - (h / h_stable)^2) about the true energy, and somewhat more where springs are compressed to a point.
+# Factor by which the energy may exceed the energy supplied by the loads. The energy of Verlet's method exceeds the true
+# energy by a factor of up to 1 / (1 - (h / h_stable)^2), and somewhat more where springs are compressed to a point.
 ENERGY_OSCILLATION = 4.0
 
 

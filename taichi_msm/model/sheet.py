@@ -75,7 +75,7 @@ def fixed_sides(sheet: Sheet) -> tuple[Side, ...]:
 
 
 def _held_points(scene: Scene, fixed: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """Return whether each mass point is fixed or clamped, shape (rows, cols), for the given fixed ones."""
+    """Return whether each mass point is fixed or clamped, shape (rows, cols)."""
     held = fixed.copy()
     for probe in scene.probes:
         if probe.clamp is not None:

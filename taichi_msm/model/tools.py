@@ -59,7 +59,7 @@ class Tool:
     shape: Shape
     friction: float  # Coulomb's coefficient; infinite if rough
     grips: tuple[tuple[float, float], ...]  # start and end of every grip [s]
-    stride_limit: float  # largest displacement between two equilibria, or in a step (there not of a clamp) [m]
+    stride_limit: float  # largest displacement between two equilibria and, except for a clamp, in a step [m]
 
     @property
     def rough(self) -> bool:
@@ -111,7 +111,7 @@ class Tool:
         return bool((depth > -1e-6 * self.radius).any())
 
     def substep_times(self, begin: float, end: float) -> Array:
-        """Divide a time interval into parts with displacements within `stride_limit`; of a rough tool also straight.
+        """Divide a time interval so that the tool moves at most `stride_limit` in each part, and a rough one straight.
 
         Args:
             begin: start of the interval [s].
@@ -388,7 +388,7 @@ def _axis_distance(a: Tool, b: Tool, offset: Array) -> Array:
 
 
 def gap_to_sheet(tool: Tool, sheet: Sheet) -> float:
-    """Return the distance of a tool at 0 s from the sheet at rest [m]; the negative depth inside the sheet.
+    """Return the distance of a tool at 0 s from the sheet at rest [m], negative inside the sheet.
 
     Args:
         tool: position-controlled tool with a shape.

@@ -58,8 +58,8 @@ from taichi_msm.terms.springs import SpringTerm
 ROWS, STRIP, FIRST_ROW, END_ROW, COUNT, SQUARED_TOLERANCE, PLACED, STEP, MIXING, POSITIVE_COUNT = range(10)
 EVALUATIONS, LARGEST, FORCE_SUM, NUMBERS = range(10, 14)
 
-# Reductions of an evaluation: the sums of F q / M, F^2 / M and q^2 / M; the squared largest force.
-POWER, SQUARED_FORCE, MOTION, SQUARE, SUMS = range(5)
+# Reductions of an evaluation: the sums of F q / M, F^2 / M and q^2 / M; the square of the largest force.
+POWER, SQUARED_FORCE, MOTION, MAX_SQUARE, SUMS = range(5)
 
 # Initial mixing factor and its decay; factors of the step; evaluations with positive power before the step grows.
 FIRST_MIXING, MIXING_DECAY, SHRINK, GROW, DELAY = 0.25, 0.99, 0.9, 1.1, 10
@@ -182,7 +182,7 @@ def _build_store(config: KernelConfig) -> Callable[..., None]:
             # `+=` on an array would be atomic.
             place = (sheet.rows + n) * width + entry.b
             sheet.work[place] = sheet.work[place] + term * inverse
-        place = (sheet.rows + SQUARE) * width + entry.b
+        place = (sheet.rows + MAX_SQUARE) * width + entry.b
         sheet.work[place] = ti.max(sheet.work[place], square)
 
     return store
@@ -284,7 +284,7 @@ def _build_relax(config: KernelConfig) -> Callable[..., None]:
                 power, force_sum, motion = add_up(sheet, POWER), add_up(sheet, SQUARED_FORCE), add_up(sheet, MOTION)
                 largest = ti.cast(0, real)
                 for b in range(1, width - 1):
-                    largest = ti.max(largest, sheet.work[(rows + SQUARE) * width + b].max())
+                    largest = ti.max(largest, sheet.work[(rows + MAX_SQUARE) * width + b].max())
                 fire[LARGEST] = largest
                 fire[FORCE_SUM] = force_sum
                 # With NaN the comparison is False and ends the loop.

@@ -231,8 +231,8 @@ def min_stable_steps(plan: Plan) -> int:
 def steps_per_frame(time: Time, limit: float) -> int:
     """Return the number of steps per frame; 1 in quasi-static scenes.
 
-    With `auto`, it is the smallest number whose step is at most half the limit. A given step is rounded to a fraction
-    of a frame. `accuracy.time_step` increases the number for a tolerance.
+    With `auto`, it is the smallest number whose step is at most half the limit; `accuracy.time_step` increases it for
+    a tolerance. A given step is rounded to a frame divided by a whole number.
 
     Args:
         time: section `time` of the scene.
@@ -361,7 +361,7 @@ def _fill_omitted_keys(before: Probe, given: Probe | Mapping[str, Any] | None) -
 
 
 def _join_paths(plan: Plan, before: Probe, given: Probe, now: float) -> tuple[Probe, int]:
-    """Prepend the past keyframes on which later steps depend to a path; return the probe and the index of the last."""
+    """Return the given probe with past keyframes that later steps need before its path, and the last one's index."""
     assert before.path is not None
     assert given.path is not None
     tolerance = FRAME_TOLERANCE / plan.grid.frames_per_second

@@ -108,7 +108,11 @@ class SheetSolver(ABC, Generic[Kernel]):
 
     @property
     def kernel(self) -> Kernel:
-        """The arrays of the sheet, with the kernels that move and read it; MsmError while a restart is incomplete."""
+        """The arrays of the sheet, with the kernels that move and read it.
+
+        Raises:
+            MsmError: when a restart was interrupted.
+        """
         if self._kernel is None:
             raise MsmError("interrupted while the sheet was restarted; restart the scene")
         return self._kernel
