@@ -42,8 +42,6 @@ class ProbeSlot:
 
     probe: int  # index of the probe in the scene
     segments: tuple[ProbeSegment, ...]  # all segments of the control point, including those of other slots
-    first_segment: int  # index of the slot's first segment
-    slot_count: int  # number of slots of the probe; every slot_count-th segment from the first belongs to the slot
 
     @property
     def moves(self) -> bool:
@@ -77,8 +75,7 @@ def probe_slots(probes: Sequence[Probe], sheet: Sheet, h: float) -> tuple[ProbeS
         jump_times = times[jumps]
         hat_ends = jump_times + 2 * h * (1 - HAT_TOLERANCE)
         jumps_in_hat = np.searchsorted(jump_times, hat_ends, "left") - np.arange(len(jump_times))
-        slot_count = 1 + int(jumps_in_hat.max(initial=0))
-        slots += [ProbeSlot(index, segments, first, slot_count) for first in range(slot_count)]
+        slots += [ProbeSlot(index, segments)] * (1 + int(jumps_in_hat.max(initial=0)))
     return tuple(slots)
 
 
