@@ -118,20 +118,13 @@ def _other_work(scene: Scene) -> float:
     return START_WORK + pixels * (ENCODING_WORK + SAMPLE_WORK * scene.render.supersample**2)
 
 
-def make_plan(scene: Scene, maps: Maps | None = None) -> Plan:
-    """Build the plan of a scene for a CPU.
-
-    Args:
-        scene: scene with valid keys; checks across keys may still fail.
-        maps: images of its stiffness maps; by default read from their files.
-
-    Returns:
-        Plan of the run.
+def make_plan(scene: Scene) -> Plan:
+    """Return the plan of a scene for a CPU.
 
     Raises:
         SceneError: when sheet, steps or paths are invalid; it lists all problems.
     """
-    plan, problems = try_plan(scene, maps)
+    plan, problems = try_plan(scene)
     if plan is None or problems:
         raise SceneError([str(problem) for problem in problems])
     return plan
