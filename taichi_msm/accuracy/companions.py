@@ -62,10 +62,13 @@ def choose_companion_runs(plan: Plan, *, requested: bool = False) -> CompanionRu
     mesh_cost = (CONTACT_MESH_COST if plan.has_contact else MESH_COST) if plan.scene.tissue is not None else 0.0
     # For a run in f32, a fine companion run needs another one in f64 with the run's own steps.
     fine_cost = fine / steps + (plan.grid.precision == "f32")
-    cost = (1 + mesh_cost) * coarse / steps if coarse else fine_cost + mesh_cost
-    if coarse and plan.has_contact:
-        # The meshes are compared with the run, not with its companion.
+    if not coarse:
+        cost = fine_cost + mesh_cost
+    elif plan.has_contact:
         cost = coarse / steps + mesh_cost
+    else:
+        # Coarser meshes are compared with the coarse companion run, whose steps are longer.
+        cost = (1 + mesh_cost) * coarse / steps
     if not requested and not affords_companions(plan, cost):
         return CompanionRuns(
             reason="it would take more than two fifths of the run; to have it anyway, pass --estimate-error"

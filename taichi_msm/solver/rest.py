@@ -130,14 +130,14 @@ class QuasiStatics(SheetSolver[Relaxation]):
     def _settle(self, frame: int, pause: Pause) -> None:
         """Find the equilibrium of a frame from that of the previous frame, through intermediate shapes."""
         self.evaluations = 0
-        relaxation, before, loads = self.kernel, self.state(), evaluate_frame_loads(self.plan, frame)
+        before, loads = self.state(), evaluate_frame_loads(self.plan, frame)
         tools, contact_before = self.plan.tools, before.memory[self.layout.config.memory_slice(ContactTerm)]
         contact = contact_rest.memory_after_grips(self.plan, frame, before.displacement, contact_before)
         gripped_before, grips = (contact_rest.is_gripping(tools, memory) for memory in (contact_before, contact))
         if tools:
             self._write_contact(contact)
         if self._interrupted:
-            relaxation.place(before.displacement)
+            self.kernel.place(before.displacement)
         self._interrupted, residual, rough = True, 0.0, any(tool.rough for tool in tools)
         times = self._shape_times(frame)
         for start, time in pairwise(times):
