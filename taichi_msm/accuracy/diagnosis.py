@@ -35,15 +35,12 @@ class Diagnosis:
 
 
 def diagnose(dynamics: SheetSolver[Any], start: Snapshot | None, pause: Pause) -> Diagnosis:
-    """Find the step, the mass point and the likely cause of a divergence within the current frame.
+    """Return the step, the mass point and the likely cause of a divergence within the current frame.
 
     Args:
         dynamics: solver that diverged; its state afterwards is arbitrary.
         start: sound state from which the run is repeated; None for the state of rest.
         pause: called several times a second; an exception from it ends the diagnosis.
-
-    Returns:
-        The message, and the last sound state.
     """
     plan, grid, bad_step = dynamics.plan, dynamics.plan.grid, dynamics.steps_done
     recorder = ForceRecorder(plan)

@@ -224,7 +224,7 @@ def _release_time(plan: Plan) -> float:
 
 
 def energy_growth_warnings(plan: Plan, progress: RunProgress) -> Iterator[str]:
-    """Warn of a growth of the energy after the last load beyond its oscillation with this time step.
+    """Yield a warning if the energy grew after the last load, beyond its oscillation with this time step.
 
     The energy is measured from the position x_n and the velocity half a step before. For a mode of frequency w it is
     between 1 - w h / 2 and 1 + w h / 2 times the energy that Verlet's method conserves, where w h / 2 is at most
@@ -233,9 +233,6 @@ def energy_growth_warnings(plan: Plan, progress: RunProgress) -> Iterator[str]:
     Args:
         plan: plan of the run.
         progress: progress of the run, with the growth of the energy.
-
-    Yields:
-        A warning with the growth, the time and remedies.
 
     Source: Hairer, Lubich and Wanner 2003, Acta Numerica 12, 399-450, on the conserved energy.
     """

@@ -222,15 +222,12 @@ class MeshCompanion:
         return self._solvers[0].tool_forces()
 
     def build_second_run(self, plan: Plan, device: Device, cores: int | None = None) -> MeshCompanion | None:
-        """Build the second companion run, which begins at the first frame.
+        """Return the second companion run, which begins at the first frame; None if the first one suffices.
 
         Args:
             plan: plan of the run.
             device: device to run on.
             cores: number of CPU cores for stepping; None for all.
-
-        Returns:
-            The second companion run; None if the first one suffices.
         """
         if self._contact and not self._narrow and self._relative_difference > SECOND_RUN_DIFFERENCE:
             coarse = coarser_plan(plan, SECOND_CELL_RATIO)
@@ -299,7 +296,7 @@ def choose_points(
     check: Callable[[Scene, Maps | None], Plan],
     progress: ProgressCallback = lambda done, total: None,
 ) -> tuple[Plan, MeshEstimate]:
-    """Search for approximately the coarsest mesh whose error is within the sheet's tolerance.
+    """Return a plan with about the coarsest mesh whose error is within the sheet's tolerance, and the estimated error.
 
     The search begins with the plan's mesh, and keeps the shape of the cells.
 
@@ -308,9 +305,6 @@ def choose_points(
         device: device for the trial runs.
         check: function that validates a scene with given maps and builds its plan.
         progress: called with the number of finished frames of each trial run and their total.
-
-    Returns:
-        The plan with that mesh, and its estimated error.
 
     Raises:
         SceneError: when no mesh within the limits meets the tolerance, or a mesh of the search is invalid.
@@ -348,15 +342,12 @@ def choose_points(
 
 
 def estimate_mesh_error(plan: Plan, device: Device, progress: ProgressCallback) -> MeshEstimate:
-    """Estimate the mesh error of a scene by a run and its companion runs, all in f64.
+    """Return the mesh error of a scene, estimated by a run and its companion runs, all in f64.
 
     Args:
         plan: plan of a scene with a `mesh_companion_plan`.
         device: device to run on.
         progress: called with the number of finished frames and their total.
-
-    Returns:
-        The estimate after the last frame.
     """
     in_f64, coarse, grid = plan.with_grid(precision="f64"), mesh_companion_plan(plan), plan.grid
     assert coarse is not None

@@ -37,11 +37,7 @@ Array = NDArray[Any]
 
 
 class PathDependence:
-    """Monitor of the path dependence of a quasi-static run.
-
-    Args:
-        plan: plan of the run.
-    """
+    """Monitor of the path dependence of a quasi-static run."""
 
     def __init__(self, plan: Plan) -> None:
         self._plan = plan

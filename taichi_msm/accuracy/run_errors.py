@@ -213,7 +213,7 @@ def run_warnings(
     affords: Callable[[Plan], bool] = lambda plan: True,
     scale: float | None = None,
 ) -> Iterator[str]:
-    """Format the error estimates and warnings of a run up to its last frame.
+    """Yield the error estimates and warnings of a run up to its last frame, a line of text each.
 
     Args:
         plan: plan of the run.
@@ -222,9 +222,6 @@ def run_warnings(
         errors: estimated errors of the run.
         affords: function that returns whether a plan runs within an hour.
         scale: pixels per metre at the middle of the sheet; None without a picture.
-
-    Yields:
-        A line of text per estimate or warning.
     """
     scene, grid = plan.scene, plan.grid
     time_step, reason, mesh, force = errors

@@ -71,15 +71,12 @@ class TimeStepEstimate:
 def choose_step(
     plan: Plan, device: Device, progress: ProgressCallback = lambda done, total: None
 ) -> tuple[Plan, TimeStepEstimate]:
-    """Search for the largest stable step whose estimated error is within the scene's tolerance.
+    """Return a plan with the largest stable step whose error is within the scene's tolerance, and the estimated error.
 
     Args:
         plan: plan with a tolerance, and with the smallest number of steps per frame of the search.
         device: device for the trial runs.
         progress: called with the number of finished frames of each trial run and their total.
-
-    Returns:
-        The plan with that step, and its estimated error.
 
     Raises:
         SceneError: when no step meets the tolerance; suggests a precision or a tolerance.
@@ -245,14 +242,11 @@ class TimeStepTrials:
         self._dynamics = Dynamics(plan, device)
 
     def estimate(self, steps: int, progress: ProgressCallback = lambda done, total: None) -> TimeStepEstimate:
-        """Run the scene with a number of steps per frame, and estimate its error.
+        """Return the error with a number of steps per frame, estimated by a run.
 
         Args:
             steps: steps per frame.
             progress: called with the number of finished frames and their total.
-
-        Returns:
-            The estimated error with these steps.
         """
         plan = self._plan.with_grid(steps_per_frame=steps)
         fine, frames = fine_steps(plan), plan.grid.frames

@@ -73,15 +73,12 @@ def decay_gradient(probe: Probe, sheet: Sheet, at: Array | None = None) -> Array
 
 
 def average_loads(plan: Plan, first: int, count: int) -> Schedule:
-    """Average the loads with the hat function of each step.
+    """Return the loads of consecutive steps, averaged with the hat function of each step.
 
     Args:
         plan: supplies the probes, their slots and the step.
         first: number of the first step.
         count: number of consecutive steps.
-
-    Returns:
-        Loads of the steps first, ..., first + count - 1.
     """
     scene, slots = plan.scene, plan.slots
     t, h = np.arange(first, first + count) / plan.grid.steps_per_second, plan.grid.step
@@ -158,7 +155,7 @@ class FrameLoad:
 
 
 def evaluate_frame_loads(plan: Plan, frame: int) -> Schedule:
-    """Evaluate the loads at a frame, as a schedule of one step.
+    """Return the loads at a frame, as a schedule of one step with one slot per probe.
 
     At a jump the loads are those after it. A keyframe within FRAME_TOLERANCE frames counts as at the frame. A
     foundation with `foundation_active: loaded` is active if any load differs from 0, or if any path has begun and not
@@ -167,9 +164,6 @@ def evaluate_frame_loads(plan: Plan, frame: int) -> Schedule:
     Args:
         plan: supplies the probes and the frame rate.
         frame: number of the frame.
-
-    Returns:
-        Loads of one step, with one slot per probe.
     """
     scene, rate = plan.scene, plan.grid.frames_per_second
     time = frame / rate
@@ -194,11 +188,7 @@ def _all_key_times(scene: Scene) -> Array:
 
 
 class LoadBounds:
-    """Bounds of the loads over time intervals.
-
-    Args:
-        plan: supplies the probes, their slots and the step.
-    """
+    """Bounds of the loads of a plan over time intervals."""
 
     def __init__(self, plan: Plan) -> None:
         scene, self._h = plan.scene, plan.grid.step

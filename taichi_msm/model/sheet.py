@@ -163,16 +163,13 @@ def point_factors(stiffness_map: StiffnessMap, image: MapImage, sheet: Sheet) ->
 
 
 def map_factors(stiffness_map: StiffnessMap, image: MapImage, rows: Array, cols: Array) -> Array:
-    """Interpolate the factors of a stiffness map bilinearly between pixel centres; constant beyond the outermost ones.
+    """Return the factors of a stiffness map, bilinear between pixel centres, constant beyond them, shape (m, n).
 
     Args:
         stiffness_map: supplies the factors of black and white.
         image: image of the map.
         rows: distances of the sampled rows from the top, as fractions of the height, shape (m,).
         cols: distances of the sampled columns from the left, as fractions of the width, shape (n,).
-
-    Returns:
-        Factors, shape (m, n).
     """
     grey = image.grey.astype(float)
     height, width = grey.shape
@@ -243,15 +240,12 @@ def material_key_problems(scene: Scene) -> Iterator[Problem]:
 
 
 def tissue_problems(scene: Scene, fixed: NDArray[np.bool_], factors: Array | None) -> Iterator[Problem]:
-    """Report impossible values of keys of tissue.
+    """Yield problems of impossible values of keys of tissue.
 
     Args:
         scene: scene for which `material_key_problems` yields nothing.
         fixed: whether each mass point is fixed, shape (rows, cols).
         factors: stiffness factors of the cells, shape (rows - 1, cols - 1); None without a readable map.
-
-    Yields:
-        Problems with the key, its value and a remedy.
     """
     tissue, sheet = scene.tissue, scene.sheet
     if tissue is None:

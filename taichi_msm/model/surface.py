@@ -131,16 +131,13 @@ class Solid(NamedTuple):
 
 
 def refine_surface(position: NDArray[np.floating], refine: int) -> Surface:
-    """Refine the sheet bilinearly (section 2 of the paper) and triangulate it.
+    """Return the triangles of the sheet after bilinear refinement (section 2 of the paper).
 
     Every small quad is divided by the diagonal from top left to bottom right.
 
     Args:
         position: positions of the mass points [m], shape (rows, cols, 3).
         refine: number of vertices inserted between neighbouring mass points.
-
-    Returns:
-        Textured triangles.
     """
     vertices = _insert(_insert(position, refine, 0), refine, 1)
     rows, cols = vertices.shape[:2]

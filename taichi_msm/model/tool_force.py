@@ -182,14 +182,11 @@ def describe_forces(record: ProbeRecord) -> str:
 
 
 def force_warnings(scene: Scene, records: Sequence[ProbeRecord]) -> Iterator[str]:
-    """Warn of probes whose forces on this sheet do not add up to their `total`.
+    """Yield warnings of probes whose forces on this sheet do not add up to their `total`.
 
     Args:
         scene: supplies the probes and the sheet.
         records: forces of all probes, from `probe_records`.
-
-    Yields:
-        Warnings with the key, the force and the likely reason.
     """
     across, down = spacing(scene.sheet)
     cell = f"a cell of {across:.3g} x {down:.3g} m"

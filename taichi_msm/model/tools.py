@@ -150,14 +150,11 @@ def touching_tools(tools: Sequence[Tool]) -> list[Tool]:
 
 
 def build_tools(probes: Sequence[Probe], sheet: Sheet) -> tuple[Tool, ...]:
-    """Build the position-controlled tools of a scene.
+    """Return the position-controlled tools of a scene, in the order of the probes.
 
     Args:
         probes: all probes of the scene; force-controlled ones are skipped.
         sheet: supplies the size, the mass points of clamps and the fixed mass points.
-
-    Returns:
-        Tools in the order of the probes.
     """
     height, width = sheet.size
     tools: list[Tool] = []
@@ -212,15 +209,12 @@ def grip_frames(grip: tuple[float, float], rate: float) -> range:
 
 
 def path_problems(scene: Scene, tools: Sequence[Tool], grid: TimeGrid) -> Iterator[Problem]:
-    """Report tools that begin in the sheet or move too fast, impossible friction, and clamps without mass points.
+    """Yield problems of tools that begin in the sheet or move too fast, of friction, and of clamps.
 
     Args:
         scene: supplies the sheet and the kind of motion.
         tools: position-controlled tools of the scene.
         grid: supplies the step, which limits the speed of tools.
-
-    Yields:
-        Problems with the key, its value and a remedy.
     """
     for tool in tools:
         key = ("probes", tool.probe, "path")
@@ -301,14 +295,11 @@ def min_steps_per_frame(tools: Sequence[Tool], grid: TimeGrid, min_steps: int) -
 
 
 def path_warnings(scene: Scene, tools: Sequence[Tool]) -> Iterator[str]:
-    """Warn of implausible paths and grips, of tools too thin for the mesh, and of tools that intersect.
+    """Yield warnings of implausible paths and grips, of tools too thin for the mesh, and of tools that intersect.
 
     Args:
         scene: supplies the sheet and the duration.
         tools: position-controlled tools of the scene.
-
-    Yields:
-        Warnings with the key, its value and a remedy.
     """
     spacing_max, side, end = max(spacing(scene.sheet)), max(scene.sheet.size), scene.time.duration
     for tool in tools:

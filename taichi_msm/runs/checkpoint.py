@@ -348,14 +348,9 @@ class Checkpoint:
 
 def _state_arrays(saved: Snapshot) -> dict[str, NDArray[Any]]:
     """Convert a state and its progress to arrays by name."""
-    forces, peaks = saved.probe_forces
-    greatest = np.array([(peak.time, *peak.force) for peak in peaks]).reshape(-1, PEAK_FORCE_COLUMNS)
-    named = {
-        **saved.state._asdict(),
-        **asdict(saved.progress),
-        "forces": _tip_force_array(forces),
-        "greatest": greatest,
-    }
+    forces, greatest = saved.probe_forces
+    peaks = np.array([(peak.time, *peak.force) for peak in greatest]).reshape(-1, PEAK_FORCE_COLUMNS)
+    named = {**saved.state._asdict(), **asdict(saved.progress), "forces": _tip_force_array(forces), "greatest": peaks}
     return {name: np.asarray(value) for name, value in named.items()}
 
 

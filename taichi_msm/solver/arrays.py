@@ -89,15 +89,12 @@ def to_lanes(layout: SheetLayout, values: NDArray[Any]) -> NDArray[Any]:
 
 
 def from_lanes(layout: SheetLayout, entries: NDArray[Any], rows: int) -> NDArray[Any]:
-    """Arrange entries by column, the inverse of `to_lanes`.
+    """Return the values of entries by column, shape (rows, cols), the inverse of `to_lanes`.
 
     Args:
         layout: layout of the sheet.
         entries: entries with halo, shape (entries, lanes), at least `rows` rows of them.
         rows: number of rows.
-
-    Returns:
-        Values, shape (rows, cols).
     """
     by_row = entries[: rows * layout.width].reshape(rows, layout.width, layout.config.lanes)
     return by_row[:, 1:-1].transpose(0, 2, 1).reshape(rows, -1)[:, : layout.cols]

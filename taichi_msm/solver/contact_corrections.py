@@ -15,7 +15,7 @@ from taichi_msm.terms.contact import CORRECTIONS, ContactTerm
 
 
 def sum_corrections(layout: SheetLayout, arrays: SheetArrays, *, clear: bool) -> NDArray[np.float64]:
-    """Sum the contact corrections over the mass points, weighted with their shares of a cell's mass.
+    """Return the sums of the contact corrections [m], weighted with shares of a cell's mass, shape (tools, 3).
 
     The order of summation depends neither on lanes nor on workers.
 
@@ -23,9 +23,6 @@ def sum_corrections(layout: SheetLayout, arrays: SheetArrays, *, clear: bool) ->
         layout: layout of the sheet.
         arrays: arrays of the sheet.
         clear: whether to set the corrections to 0 afterwards.
-
-    Returns:
-        Sums [m], shape (tools, 3).
     """
     contact = layout.config.get(ContactTerm)
     if contact is None:

@@ -101,14 +101,11 @@ class Dynamics(SheetSolver[StepKernel]):
         return mean_force(self.plan, sums, self.plan.grid.steps_per_frame)
 
     def step_table(self, first: int, count: int) -> NDArray[Any]:
-        """Compute the load table of consecutive steps.
+        """Return the load table of consecutive steps, shape (count, columns).
 
         Args:
             first: number of the first step.
             count: number of steps.
-
-        Returns:
-            Load table, shape (count, columns).
         """
         table = self._load_table(average_loads(self.plan, first, count), first)
         _, table[:, GAIN], first_gain = coefficients(self.plan)
@@ -154,16 +151,13 @@ class ForceRecorder:
         return ProbeForces(forces, tuple(PeakForce(0.0, tip.force) for tip in forces))
 
     def at_frame(self, before: ProbeForces, frame: int, position: NDArray[Any], tool_forces: Array) -> ProbeForces:
-        """Compute the forces at a frame and their maxima up to it.
+        """Return the forces at a frame and their maxima up to it.
 
         Args:
             before: forces and maxima at the previous frame.
             frame: number of the frame.
             position: positions of the mass points [m], shape (rows, cols, 3).
             tool_forces: forces of the position-controlled tools [N], shape (tools, 3), see `SheetSolver.tool_forces`.
-
-        Returns:
-            Forces at the frame, and maxima up to it.
         """
         forces, time = self._forces(frame, position, tool_forces), frame / self._plan.grid.frames_per_second
         peaks = zip(before.greatest, (PeakForce(time, tip.force) for tip in forces), strict=True)

@@ -78,14 +78,11 @@ class Work(NamedTuple):
 
 
 def count_work(plan: Plan, companions: float) -> Work:
-    """Estimate the work of a run.
+    """Return the estimated work of a run by stages [f32 steps of a mass point].
 
     Args:
         plan: plan of the run.
         companions: work of its companion runs [f64 steps of the sheet per step of the run].
-
-    Returns:
-        Work by stages [f32 steps of a mass point].
     """
     steps = _stepping_work(plan)
     stepping = F64_WORK * steps if plan.grid.precision == "f64" else steps
@@ -155,14 +152,11 @@ def try_plan(scene: Scene, maps: Maps | None = None) -> tuple[Plan | None, list[
 
 
 def plan_variant(plan: Plan, scene: Scene) -> Plan:
-    """Build the plan of a modified scene without checks.
+    """Return the plan of a modified scene, without checks.
 
     Args:
         plan: plan of the original scene, whose maps are reused.
         scene: the modified scene, known to be valid.
-
-    Returns:
-        Plan of the modified scene.
     """
     return _plan(scene, plan.maps, fixed_points(scene.sheet), derive_material(scene, plan.maps))
 

@@ -35,15 +35,12 @@ CACHED_BAND_BYTES = 384 << 10
 
 
 def choose_layout(plan: Plan, device: Device, cores: int | None = None) -> SheetLayout:
-    """Choose the memory layout of a sheet, its division among workers, and the configuration of its kernels.
+    """Return the memory layout of a sheet, its division among workers, and the configuration of its kernels.
 
     Args:
         plan: plan of the run.
         device: device of the arrays.
         cores: largest number of CPU cores; by default all available cores.
-
-    Returns:
-        Layout of the sheet.
 
     Raises:
         DeviceError: when the device does not support the scene.
@@ -133,10 +130,7 @@ class SheetSolver(ABC, Generic[Kernel]):
         self.inconsistent = False
 
     def steer(self, plan: Plan) -> None:
-        """Continue with other probes, with the same kernels and the same steps.
-
-        Args:
-            plan: a plan that differs in its probes only.
+        """Continue with a plan that differs in its probes only, with the same kernels and steps.
 
         Raises:
             ArgumentError: when the new probes require other kernels.
@@ -187,14 +181,11 @@ class SheetSolver(ABC, Generic[Kernel]):
         self._kernel = None
 
     def _load_table(self, loads: Schedule, first: int) -> NDArray[Any]:
-        """Compute the load table of consecutive steps, with a gain of 0.
+        """Return the load table of consecutive steps, with a gain of 0, shape (steps, columns).
 
         Args:
             loads: loads at the steps.
             first: number of the first step.
-
-        Returns:
-            Load table in the precision of the kernels, shape (steps, columns).
         """
         config = self.layout.config
         table = np.zeros((len(loads.active), config.first_column(None)))
@@ -206,11 +197,7 @@ class SheetSolver(ABC, Generic[Kernel]):
             return table.astype(self._dtype)
 
     def _measure(self, *, moving: bool) -> Reading:
-        """Read and measure the sheet.
-
-        Args:
-            moving: whether the energy includes the kinetic energy.
-        """
+        """Read and measure the sheet; with `moving`, the energy includes the kinetic energy."""
         displacement, measures = self._read_arrays(differences=False)
         config, plan = self.layout.config, self.plan
         springs = measures[:, config.first_measure(SpringTerm) :]
