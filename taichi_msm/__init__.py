@@ -70,6 +70,10 @@ __all__ += ["FitResult", "FittedMap", "Gradient"]
 __all__ += ["export", "fit", "gradient", "load_scene", "resume", "run", "sweep"]
 
 
+def __dir__() -> list[str]:
+    return sorted(__all__)
+
+
 def __getattr__(name: str) -> Any:
     from importlib import import_module
 

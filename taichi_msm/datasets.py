@@ -32,9 +32,9 @@ class Pair(TypedDict):
 
     first: NDArray[np.uint8]  # RGB, shape (3, height, width)
     second: NDArray[np.uint8]  # RGB, shape (3, height, width)
-    flow: NDArray[np.float32]  # displacement (x right, y down) [px], shape (2, height, width); 0 where unknown
-    valid: NDArray[np.bool_]  # whether flow is known: True on tissue; shape (height, width)
-    occluded: NDArray[np.bool_]  # tissue hidden or outside the picture in the second frame; shape (height, width)
+    flow: NDArray[np.float32]  # displacement (x right, y down) [px], 0 where not valid; shape (2, height, width)
+    valid: NDArray[np.bool_]  # True on tissue, whose flow is known; shape (height, width)
+    occluded: NDArray[np.bool_]  # True on tissue that is hidden or outside in the second frame; shape (height, width)
     depth: NDArray[np.float32]  # along the viewing direction [m], 0 on the background; shape (height, width)
 
 
@@ -47,9 +47,9 @@ class Clip(TypedDict):
 
 
 class _Split:
-    """Base class: the runs of a split, cut into windows of `length` frames, one every `stride` frames."""
+    """Base class: the runs of a split, cut into windows of `length` frames that begin every `stride` frames."""
 
-    outputs: ClassVar[tuple[str, ...]]  # required entries of `output`
+    outputs: ClassVar[tuple[str, ...]]  # required outputs of the runs
 
     def __init__(self, directory: str | Path, split: str, length: int, stride: int, camera: str) -> None:
         self.directory, self._camera = Path(directory), camera
@@ -58,7 +58,7 @@ class _Split:
         except OSError as error:
             fault = f"{self.directory / 'dataset.json'}: {error.strerror}"
             raise FilesError(f"{fault}; name the folder that `taichi-msm sweep` wrote") from None
-        # Run number, folder, split ("part") and varied "values" of each run.
+        # Number ("run"), folder, split ("part") and varied values of each run.
         self.runs: list[dict[str, Any]] = [run for run in content["runs"] if run["part"] == split]
         if not self.runs:
             splits = ", ".join(sorted({run["part"] for run in content["runs"]})) or "none, as no run is complete"
@@ -89,13 +89,13 @@ class _Split:
         return DataLoader(self, **options)
 
     def _find(self, index: int) -> tuple[Path, int]:
-        """Return folder and first frame of a window: its run, and the camera in it."""
+        """Return the folder of the camera, within that of the run, and the first frame of a window."""
         run, window = divmod(range(len(self))[index], self._windows)
         return self.directory / self.runs[run]["folder"] / self._camera, window * self._stride
 
 
 class Pairs(_Split):
-    """Data set of all pairs of successive frames of a split.
+    """Data set of the pairs of successive frames of a split.
 
     Args:
         directory: folder of the sweep.
@@ -128,11 +128,11 @@ class Pairs(_Split):
 
 
 class Clips(_Split):
-    """Data set of all clips of a split, without overlap.
+    """Data set of the clips of a split, without overlap.
 
     Args:
         directory, split, camera: as for `Pairs`.
-        frames: frames per clip.
+        frames: number of frames in a clip.
 
     Raises:
         ArgumentError, FilesError: as for `Pairs`.

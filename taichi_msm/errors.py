@@ -1,6 +1,6 @@
-"""Errors for the user, checks of the arguments of library calls, and the types of progress callbacks.
+"""Errors for the user, checks of arguments of library calls, and types of progress callbacks.
 
-Only the command line prints errors or turns them into exit codes.
+Only the command line prints errors, or turns them into exit codes.
 """
 
 from __future__ import annotations
@@ -26,8 +26,8 @@ class Problem:
     """A fault of a scene.
 
     Attributes:
-        path: path to the key at fault; empty for the whole scene.
-        message: the value, its fault and the remedy, without the key.
+        path: path to the faulty key; empty for the whole scene.
+        message: value, fault and remedy, without the key.
     """
 
     path: Key
@@ -35,7 +35,7 @@ class Problem:
 
     @property
     def key(self) -> str:
-        """The key in dotted form, as users write it: probes.0.load."""
+        """The key in dotted form, such as probes.0.load."""
         return ".".join(str(part) for part in self.path)
 
     def __str__(self) -> str:
@@ -43,18 +43,18 @@ class Problem:
 
 
 class MsmError(Exception):
-    """Base class of all errors of this package that are meant for the user."""
+    """Base class of the errors of this package that a user can remedy."""
 
 
 class SceneError(MsmError):
     """A scene is invalid or cannot be run.
 
     Attributes:
-        lines: one line for each fault, with control characters escaped.
+        lines: a line for each fault, with control characters escaped.
     """
 
     def __init__(self, lines: Sequence[str]) -> None:
-        # Two checks may report the same fault of a value.
+        # Two checks may report the same fault.
         self.lines = tuple(dict.fromkeys(printable(line) for line in lines))
         super().__init__("\n".join(self.lines))
 
@@ -63,7 +63,7 @@ class SceneError(MsmError):
 
 
 class DeviceError(MsmError):
-    """The requested arch, thread count or compiler is not available, or the device skipped part of its work."""
+    """The requested arch, thread count, compiler or port is not available, or the device skipped part of its work."""
 
 
 class NotInstalledError(MsmError):
@@ -71,19 +71,19 @@ class NotInstalledError(MsmError):
 
 
 class ExecutorError(MsmError):
-    """The executor of the runs of a sweep cannot be reached, or is not suitable."""
+    """The executor of a sweep cannot be reached, or is not suitable."""
 
 
 class LostExecutorError(ExecutorError):
-    """The executor of the runs of a sweep stopped accepting runs."""
+    """The executor of a sweep accepts no more runs."""
 
 
 class ArgumentError(MsmError, ValueError):
-    """An argument of a call is invalid; the message contains its name, its value and the allowed values."""
+    """An argument of a library call is invalid; the message contains its name, its value and the allowed values."""
 
 
 class DivergedError(MsmError):
-    """The simulation diverged. `step`, `time` and `point` are also attributes.
+    """The simulation diverged. All arguments but the message are also attributes.
 
     Args:
         message: time, mass point, fault and remedy.
@@ -105,18 +105,18 @@ class FilesError(MsmError):
 
 
 class ForeignError(FilesError):
-    """A foreign file or folder, not written by this program, is at the path of a result. It is unchanged."""
+    """A file or folder at the path of a result was not written by this program, and is left unchanged."""
 
     @classmethod
     def at(cls, path: object, kind: str) -> ForeignError:
-        """Build the error for a foreign entry at the path of a result.
+        """Build the error for a path.
 
         Args:
-            path: foreign entry.
+            path: path of the foreign file or folder.
             kind: noun for the message, such as "a file"; see `directory.entry_kind`.
 
         Returns:
-            The error, for a `raise` statement.
+            The error, to be raised.
         """
         return cls(f"{path}: {kind} not written by this program; move it away or choose another folder")
 
@@ -126,7 +126,7 @@ class DamagedError(FilesError):
 
 
 def printable(text: str) -> str:
-    """Escape line breaks, control characters and surrogates of a text."""
+    """Escape the line breaks, control characters and surrogates in a text."""
     return "".join(c if c.isprintable() else c.encode("unicode_escape").decode() for c in text)
 
 
@@ -135,18 +135,18 @@ MAX_VALUE_LENGTH = 60
 
 
 def truncate(text: str) -> str:
-    """Truncate a text to the length of a value in a message."""
+    """Truncate a text to `MAX_VALUE_LENGTH`, with an ellipsis."""
     return text if len(text) <= MAX_VALUE_LENGTH else text[:MAX_VALUE_LENGTH] + "..."
 
 
 def did_you_mean(name: str, known: Iterable[str]) -> str:
-    """Return a hint for a message about an unknown name, such as "; did you mean 'top'?".
+    """Return a hint for the message of an unknown name, such as "; did you mean 'top'?"; empty without a similar name.
 
     Args:
-        name: the unknown name; case is ignored.
-        known: valid names, of which the most similar is proposed; without a similar one, the hint is empty.
+        name: unknown name; case is ignored.
+        known: valid names.
     """
-    # Imported here, as it is needed only for a message.
+    # Imported here, as only a message needs it.
     from difflib import get_close_matches
 
     # Matching takes time in proportion to the length of the name.
@@ -163,7 +163,7 @@ def writing(path: object, option: str = "--out") -> Iterator[None]:
         option: command-line option of the path, for the remedy.
 
     Raises:
-        FilesError: in place of the OSError; contains its reason and the remedy.
+        FilesError: in place of the OSError, with its reason and the remedy.
     """
     try:
         yield
@@ -174,10 +174,10 @@ def writing(path: object, option: str = "--out") -> Iterator[None]:
 
 
 def out_of_memory(error: Exception) -> str:
-    """Return a message with the remedy for a failed allocation of memory; empty for other errors."""
-    # Taichi prefixes its messages with a line of its source, in brackets.
+    """Return the message of a failed allocation of memory, with the remedy; empty for other errors."""
+    # Taichi puts a source line in brackets before its messages.
     reason = re.sub(r"^\[.*?\] ", "", " ".join(str(error).split())).rstrip(".")
-    # The compilers and the encoder of pictures raise a RuntimeError.
+    # Compilers and picture encoders raise a RuntimeError.
     if isinstance(error, MemoryError) or re.search(
         r"MemoryError|memory allocation|out of memory", reason, re.IGNORECASE
     ):
@@ -186,7 +186,7 @@ def out_of_memory(error: Exception) -> str:
     return ""
 
 
-# Limit of the numbers of processes and threads.
+# Largest number of processes or threads.
 MAX_WORKERS = 1024
 
 
@@ -203,7 +203,7 @@ def as_array(values: Any, name: str) -> NDArray[Any]:
     Raises:
         ArgumentError: when conversion fails, such as for rows of different lengths.
     """
-    # Imported here, so that a scene can be checked without importing NumPy.
+    # Imported here, so that the check of a scene does not import NumPy.
     import numpy as np
 
     try:
@@ -213,23 +213,23 @@ def as_array(values: Any, name: str) -> NDArray[Any]:
 
 
 def is_real_array(array: NDArray[Any], shape: tuple[int, ...]) -> bool:
-    """Return whether an array has a real dtype and a given shape.
+    """Return whether an array has an integer or floating dtype and a given shape.
 
     Args:
         array: array of any dtype.
-        shape: expected shape, compared exactly.
+        shape: expected shape; a 1 does not broadcast.
     """
     return array.dtype.kind in "fiu" and array.shape == shape
 
 
 def require_frame_count(frames: int) -> None:
-    """Require a number of frames to be a whole number, 0 or more; raise an ArgumentError otherwise."""
+    """Raise an ArgumentError unless a number of frames is a whole number, 0 or more."""
     if isinstance(frames, bool) or not isinstance(frames, Integral) or frames < 0:
         raise ArgumentError(f"{frames!r} frames cannot be simulated; take a whole number, 0 or more")
 
 
 def require_path(path: str | Path, name: str = "directory", remedy: str = "take a path") -> None:
-    """Require that an argument of a library call is a path.
+    """Raise an ArgumentError unless an argument of a library call is a path.
 
     Args:
         path: argument of any type.
@@ -237,19 +237,19 @@ def require_path(path: str | Path, name: str = "directory", remedy: str = "take 
         remedy: advice at the end of the message.
 
     Raises:
-        ArgumentError: when it is neither a text nor a Path, or contains null characters.
+        ArgumentError: when the argument is neither a text nor a Path, or contains a null character.
     """
     if not isinstance(path, (str, Path)) or "\0" in str(path):
         raise ArgumentError(f"{name}: {path!r}; {remedy}")
 
 
-# Callbacks of long computations. An exception that a callback raises stops the computation.
+# Callbacks of long computations, which an exception from the callback stops.
 
-# Called several times a second, to let the caller interrupt.
+# Called several times a second, so that the caller can interrupt.
 Pause = Callable[[], None]
 
 # Called with the completed and the total amount of work.
 ProgressCallback = Callable[[int, int], None]
 
-# Called with the name of the stage, and the completed and the total amount of its work.
+# Called with the stage, and the completed and the total amount of its work.
 StageProgressCallback = Callable[[str, int, int], None]

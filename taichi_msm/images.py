@@ -20,27 +20,27 @@ if TYPE_CHECKING:
 PICTURE_FORMATS = ("PNG", "JPEG", "WEBP", "BMP", "TIFF")
 PICTURE_SUFFIXES = (".png", ".jpg", ".jpeg", ".webp", ".bmp", ".tif", ".tiff")
 
-# Pillow's modes of pixels. Modes with 32-bit and floating-point greys are excluded, as their range is not defined.
+# Accepted pixel modes of Pillow, without 32-bit and floating-point greys, whose range is not defined.
 _MODES_16_BIT = ("I;16", "I;16L", "I;16B", "I;16N")
 _MODES = ("1", "L", "LA", "P", "PA", "RGB", "RGBA", "RGBa", "RGBX", "CMYK", "YCbCr", *_MODES_16_BIT)
 
-# Maximum side [px]. Pillow spends memory and time on every row, even with a single column.
+# Largest side [px]. Pillow spends memory and time on every row, even of a single column.
 MAX_SIDE_PX = 65535
 
-# Maximum size of a file [bytes]; Pillow's largest picture, with four channels of 16 bits, is smaller.
+# Largest file [bytes], larger than Pillow's largest picture with four channels of 16 bits.
 MAX_BYTES = 2**31
 
-# Path of the copy to read, by the path of the original file.
+# Path of the copy that is read in place of a file, by path of the file.
 _copies: Mapping[str, Path] = {}
 
 
 class PictureError(Exception):
-    """The file cannot be used as a picture; the message contains the reason and the remedy."""
+    """A file cannot be used as a picture; the message contains the reason and the remedy."""
 
 
 @contextmanager
 def use_copies(copies: Mapping[str, Path]) -> Iterator[None]:
-    """Within the block, read copies in place of the originals; `copies` maps original to copy."""
+    """Read copies of files within the block; `copies` has their paths by path of the file."""
     global _copies
     previous, _copies = _copies, copies
     try:
@@ -55,7 +55,7 @@ def read_rgb(path: str, background: tuple[int, int, int], sha256: str | None = N
     Args:
         path: path of the file.
         background: colour behind transparent pixels.
-        sha256: required SHA-256 of the file, in hexadecimal; any if None.
+        sha256: required SHA-256 of the file, in hexadecimal; None for any.
 
     Returns:
         The picture, converted from the file's colour profile to sRGB.
@@ -77,10 +77,10 @@ def read_grey(path: str, sha256: str | None = None) -> NDArray[Any]:
 
     Args:
         path: path of the file.
-        sha256: required SHA-256 of the file, in hexadecimal; any if None.
+        sha256: required SHA-256 of the file, in hexadecimal; None for any.
 
     Returns:
-        Grey values, uint16 for a file of 16 bits, else uint8, shape (height, width).
+        Grey values, shape (height, width), as uint16 for a file of 16 bits, otherwise as uint8.
 
     Raises:
         PictureError: when the file cannot be used or has another SHA-256.
@@ -100,8 +100,8 @@ def picture_size(path: str) -> tuple[int, int]:
     from PIL import Image
 
     with _open(path) as image:
-        # For TIFF, Pillow swaps width and height itself. The getexif() of the base class reads only the header, that of
-        # PNG decodes the picture. The orientations (tag 0x0112) 5 to 8 swap width and height.
+        # Orientations (tag 0x0112) 5 to 8 swap width and height; for TIFF, Pillow does it. The base class reads only
+        # the header, the getexif of PNG decodes the picture.
         if image.format != "TIFF" and Image.Image.getexif(image).get(0x0112) in (5, 6, 7, 8):
             return image.height, image.width
         return image.size
@@ -125,11 +125,11 @@ def file_sha256(path: str) -> str:
 
 @contextmanager
 def _open(path: str, sha256: str | None = None) -> Iterator[Image.Image]:
-    """Open and check a picture; raise any error, also of the block, as a PictureError."""
+    """Open and check a picture; convert all errors, also of the block, to a PictureError."""
     from PIL import Image, UnidentifiedImageError
 
     _require_file(path)
-    # libtiff and Pillow raise their errors, and print them to stderr.
+    # libtiff and Pillow also print the errors that they raise.
     with discarded_output(2), warnings.catch_warnings():
         warnings.simplefilter("ignore")
         warnings.simplefilter("error", Image.DecompressionBombWarning)
@@ -145,7 +145,7 @@ def _open(path: str, sha256: str | None = None) -> Iterator[Image.Image]:
                     raise PictureError(f"{path} {reason}")
                 if image.format in ("JPEG", "MPO"):
                     scans = _count_scans(file)
-                    # A scan is one pass over the picture. Encoders write about ten scans; more are allowed up to 200
+                    # A scan is a pass over the picture, and encoders write about ten. More are allowed up to 200
                     # million pixels in all, which take a few seconds.
                     limit = max(16, 200_000_000 // (image.width * image.height))
                     if scans > limit:
@@ -181,7 +181,7 @@ def _count_scans(file: BinaryIO) -> int:
             b"",
             b"\xd9",
         ):
-            # Stuffed bytes, padding and restart markers occur within the data of a scan, without a length field.
+            # Stuffed bytes, padding and restart markers have no length field.
             if marker in b"\x00\x01\xff" or b"\xd0" <= marker <= b"\xd8":
                 offset += 1 if marker == b"\xff" else 2
                 continue
@@ -191,9 +191,9 @@ def _count_scans(file: BinaryIO) -> int:
 
 
 def irregular_kind(path: Path) -> str:
-    """Describe a path that is not a regular file, without opening it; return "" for a regular file.
+    """Return the kind of a path that is not a regular file; empty for a regular file.
 
-    Opening a pipe would block.
+    The path is not opened: a pipe would block.
     """
     mode = path.stat().st_mode
     if stat.S_ISREG(mode):
@@ -202,7 +202,7 @@ def irregular_kind(path: Path) -> str:
 
 
 def actual_path(path: str) -> Path:
-    """Return the path to read: that of the copy within `use_copies`, otherwise `path`."""
+    """Return the path to read: the path itself, or that of its copy within `use_copies`."""
     return _copies.get(path) or Path(path)
 
 
@@ -235,7 +235,7 @@ def _to_8_bit(image: Image.Image) -> Image.Image:
 
 
 def _to_srgb(path: str, image: Image.Image, profile: bytes | None) -> Image.Image:
-    """Convert 8-bit colours from a colour profile to sRGB, with the perceptual intent."""
+    """Convert 8-bit colours of a colour profile to sRGB, with the perceptual intent."""
     if not profile:
         return image
     import io
@@ -245,7 +245,7 @@ def _to_srgb(path: str, image: Image.Image, profile: bytes | None) -> Image.Imag
     try:
         source = ImageCms.ImageCmsProfile(io.BytesIO(profile))
         space = source.profile.xcolor_space.strip()
-        # Profiles of any other space apply to RGB pixels.
+        # A profile of any other space is for RGB pixels.
         mode = {"GRAY": "L", "CMYK": "CMYK"}.get(space, "RGB")
         valid_modes = {"L": ("1", "L", "LA"), "CMYK": ("CMYK",)}.get(mode, tuple(m for m in _MODES if m != "CMYK"))
         if image.mode not in valid_modes:

@@ -119,6 +119,9 @@ def test_invalid_data_set(data_set: Path, tmp_path: Path, message: Messages) -> 
     (tmp_path / "dataset.json").write_text(json.dumps({**record, "outputs": ["frames", "run.json"]}))
     with message.raises(ArgumentError, "flow"):
         Pairs(tmp_path, "train")
+    (tmp_path / "dataset.json").write_text(json.dumps({**record, "runs": []}))
+    with message.raises(ArgumentError, "split"):
+        Pairs(tmp_path, "train")
 
 
 def test_pytorch_is_not_installed(data_set: Path, monkeypatch: pytest.MonkeyPatch, message: Messages) -> None:

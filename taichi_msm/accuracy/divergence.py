@@ -14,7 +14,7 @@ from taichi_msm.model.sheet import spacing
 from taichi_msm.solver.state import LargestDisplacement, Reading, RunProgress, largest_displacement
 from taichi_msm.terms import TERMS
 from taichi_msm.terms.foundation import FoundationTerm, foundation_energy, point_shares
-from taichi_msm.terms.loads import force_norm, max_free_acceleration
+from taichi_msm.terms.loads import decay_norm_bound, max_free_acceleration
 
 # Factor by which the energy may exceed the energy supplied by the loads. The energy of Verlet's method exceeds the true
 # energy by a factor of up to 1 / (1 - (h / h_stable)^2), and somewhat more where springs are compressed to a point.
@@ -80,7 +80,7 @@ class DivergenceMonitor:
         self.progress = progress or RunProgress()
         self._grid, material = plan.grid, plan.material
         self._acceleration = self._tool_energy = 0.0
-        self._load_norms = np.array([force_norm(slot, plan.scene) for slot in plan.slots])
+        self._load_norms = np.array([decay_norm_bound(slot, plan.scene) for slot in plan.slots])
         self._oscillation = ENERGY_OSCILLATION / max(1e-9, 1 - (plan.grid.step / plan.stable_step) ** 2)
         self._relaxing_share = sum(share for share, _ in material.relaxation)
         self._oscillation /= 1 - self._relaxing_share

@@ -19,6 +19,7 @@ from taichi_msm.accuracy.mesh import (
     MAX_DIFFERENCE,
     NO_CONTACT,
     NOT_CONVERGED,
+    WRINKLING,
     MeshCompanion,
     MeshEstimate,
     mesh_companion_plan,
@@ -99,7 +100,6 @@ class RunErrorEstimator:
         reference = plan.with_grid(steps_per_frame=steps) if self._mesh_follows_coarse else plan
         self._mesh = None if coarse is None else MeshCompanion(reference, coarse, device, cores)
         self._squared_errors, self._contact_frames, self._max_force = np.zeros((3, len(plan.tools)))
-        self._has_all_forces = True  # whether the forces of all frames so far are known
 
     def compile(self) -> None:
         """Compile the kernels before the first frame."""
@@ -107,25 +107,20 @@ class RunErrorEstimator:
             if companion is not None:
                 companion.compile()
 
-    def compare_frame(
-        self, displacement: NDArray[Any], pause: Pause, forces: NDArray[np.float64] | None = None
-    ) -> None:
+    def compare_frame(self, displacement: NDArray[Any], pause: Pause, forces: NDArray[np.float64]) -> None:
         """Step to the next frame and compare it.
 
         Args:
             displacement: displacements of the run at that frame [m], shape (rows, cols, 3).
             pause: called several times a second; after an exception from it the companion runs cannot continue.
-            forces: mean forces of the position-controlled tools since the previous frame [N], shape (tools, 3); None if
-                unknown.
+            forces: mean forces of the position-controlled tools since the previous frame [N], shape (tools, 3).
         """
         if self._time_step is not None:
             self._time_step.compare_frame(displacement, pause)
         if self._mesh is not None:
             coarse = self._time_step if self._mesh_follows_coarse else None
             self._mesh.compare_frame(coarse.displacement if coarse else displacement, pause)
-        if forces is None:
-            self._has_all_forces = False
-        elif self._plan.tools and self._mesh is not None:
+        if self._plan.tools and self._mesh is not None:
             coarse_forces = self._mesh.tool_forces()
             error = FORCE_ERROR_FACTOR * np.abs(forces - coarse_forces)
             if self._time_step is not None:
@@ -178,7 +173,7 @@ class RunErrorEstimator:
         if self._mesh is not None:
             known = known._replace(mesh=self._mesh.estimate)
             in_contact = self._max_force[[not isinstance(tool, Clamp) for tool in self._plan.tools]].all()
-            if self._has_all_forces and not in_contact:
+            if not in_contact:
                 known = known._replace(mesh=MeshEstimate(math.inf, NO_CONTACT))
             elif self._plan.has_contact and known.time_step is not None and known.time_step.error > MAX_DIFFERENCE:
                 known = known._replace(mesh=MeshEstimate(math.inf, LARGE_STEP_ERROR))
@@ -187,9 +182,8 @@ class RunErrorEstimator:
     def _force_estimate(self, known: RunErrorEstimates) -> ForceEstimate:
         mesh = known.mesh
         if self._mesh is None or mesh is None:
-            return ForceEstimate(None, "there is no run with fewer points")
-        if not self._has_all_forces:
-            return ForceEstimate(None, "the forces of the frames before the run was continued are not kept")
+            reason = "there is no run with fewer points"
+            return ForceEstimate(None, reason if mesh is None else "the search for sheet.tolerance compares no forces")
         if mesh.error == math.inf:
             return ForceEstimate(None, mesh.doubt)
         if not self._max_force.any():
@@ -230,9 +224,10 @@ def run_warnings(
             "; mesh error unknown: another number of points is another sheet" if scene.tissue is None else ""
         )
     if time_step is not None:
-        if REMEDY_THRESHOLD < time_step.error < math.inf:
-            of_step = not time_step.separate or time_step.in_f64 > REMEDY_THRESHOLD / 2
-            source = "the time step" if of_step else "rounding"
+        if REMEDY_THRESHOLD < time_step.error < math.inf and not time_step.separate:
+            yield "--estimate-error separates the errors of the time step and of rounding"
+        elif REMEDY_THRESHOLD < time_step.error < math.inf:
+            source = "the time step" if time_step.in_f64 > REMEDY_THRESHOLD / 2 else "rounding"
             yield f"for a smaller error of {source}, {_step_remedy(plan, time_step, affords)}"
     elif reason == QUASISTATIC_REASON:
         yield "error: no time step in a quasi-static scene"
@@ -276,8 +271,8 @@ def run_warnings(
     damping_ratio = plan.material.drag * grid.step
     if damping_ratio > 2 and scene.time.damping_difference == "central":
         yield (
-            f"the damping stops a point within 1/{damping_ratio:.3g} of a step: velocities change their sign at every "
-            f"step; take a time.step of at most {2 * grid.step / damping_ratio:.2g} s"
+            f"the time step is {damping_ratio:.3g} times the time constant of the damping, so velocities change their "
+            f"sign at every step; take a time.step of at most {2 * grid.step / damping_ratio:.2g} s"
         )
 
 
@@ -324,19 +319,18 @@ def _digits(number: float, digits: int = 1) -> str:
 
 
 def _mesh_remedy(plan: Plan, mesh: MeshEstimate, affords: Callable[[Plan], bool]) -> str:
-    """Suggest a remedy for the mesh error: a finer mesh, if it has at most four times the mass points."""
-    scene, refinement = plan.scene, math.sqrt(mesh.error / (REMEDY_THRESHOLD / 2))
-    rows, cols = (math.ceil((count - 1) * refinement) + 1 for count in scene.sheet.points)
-    allowed = rows * cols <= MAX_POINTS_RATIO * math.prod(scene.sheet.points) and max(rows, cols) < MAX_POINTS
-    if allowed and affords(plan_variant(plan, with_points(scene, (rows, cols)))):
+    """Suggest a remedy for the mesh error: a finer mesh with at most `MAX_POINTS_RATIO` times the mass points."""
+    if mesh.doubt == WRINKLING:
+        return "set tissue.bending or tissue.pretension; without them, a finer mesh has finer wrinkles"
+    refinement = min(math.sqrt(mesh.error / (REMEDY_THRESHOLD / 2)), math.sqrt(MAX_POINTS_RATIO))
+    rows, cols = (math.ceil((count - 1) * refinement) + 1 for count in plan.scene.sheet.points)
+    if max(rows, cols) < MAX_POINTS and affords(plan_variant(plan, with_points(plan.scene, (rows, cols)))):
         return f"try sheet.points: {[rows, cols]}"
-    return "set tissue.bending or tissue.pretension, or take a wider tip; more points help less"
+    return "take a wider tip or a smaller sheet; more sheet.points would take more than an hour"
 
 
 def _step_remedy(plan: Plan, estimate: TimeStepEstimate, affords: Callable[[Plan], bool]) -> str:
     """Suggest a remedy for the error of the time step and of rounding."""
-    if not estimate.separate:
-        return "pass --estimate-error, which separates the errors of the step and of rounding"
     remedies = []
     if estimate.rounding > REMEDY_THRESHOLD / 2:
         remedies.append("time.precision: f64")

@@ -58,8 +58,9 @@ def focal_fault(focal: Sequence[float], size: Sequence[float]) -> str:
     """
     for name, extent, length, pixels in zip(("fx", "fy"), ("width", "height"), focal, size, strict=True):
         if length < pixels / 20:
-            fault = f"{name} = {length:g} is below 1/20 of the picture {extent}, {pixels:g} px, too short for any lens"
-            return f"{fault}; convert it to pixels (normalised: multiply by {pixels:g}; mm: divide by the pixel pitch)"
+            fault = f"{name} = {length:g} is below 1/20 of the picture {extent}, {pixels:g} px"
+            remedy = f"convert it to pixels (normalised: multiply by {pixels:g}; mm: divide by the pixel pitch)"
+            return f"{fault}, too short to be in pixels; {remedy}"
     return ""
 
 
@@ -70,6 +71,6 @@ class CalibrationReader(NamedTuple):
     recognised_by: str  # content by which a file is recognised, for users
     cameras: Callable[[CameraFile], Sequence[Keys]]  # keys of each camera, the left one first; empty for another format
     read: Callable[[Keys], Calibration]
-    # From the keys of the right camera, its pose in the unit of the file.
+    # Function that returns the pose of the right camera from its keys, in the unit of the file.
     pose: Callable[[Keys], StereoPose | None] = lambda keys: None
     unit: float | None = 1.0  # unit of lengths in the file [m]; None where the format does not define it

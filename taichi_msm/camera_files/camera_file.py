@@ -22,7 +22,7 @@ LENGTH_UNITS = {"m": 1.0, "mm": 1e-3}
 # Largest depth of nested values. Matrices are nested two or three deep.
 MAX_DEPTH = 20
 
-# Comments and empty lines; after them the first section of an ini file, or OpenCV's directive, which is not valid YAML.
+# Comments and empty lines, which may precede the first section of an ini file, or OpenCV's directive, no valid YAML.
 _COMMENTS = r"((?:[ \t]*(?:[#;][^\n]*)?\r?\n)*)"
 _INI = re.compile(_COMMENTS + r"[ \t]*\[[^\]\n=,]*\][ \t]*\r?\n" + _COMMENTS + r"[^\n]*=")
 _DIRECTIVE = re.compile(_COMMENTS + r"%YAML[^\n]*")
@@ -153,7 +153,7 @@ def _json(text: str) -> Any:
     try:
         return json.loads(text, object_pairs_hook=lambda pairs: _entries((*pair, None) for pair in pairs))
     except json.JSONDecodeError as error:
-        # The fault is at the end of the text, in its last word, or in an unclosed string.
+        # A truncated text ends within a string or a word.
         if error.msg.startswith("Unterminated") or re.fullmatch(r"[\w.+\\-]*\s*", text[error.pos :]):
             raise _truncated(text, "JSON") from None
         place = f"invalid JSON from column {error.colno} on"

@@ -23,9 +23,9 @@ class Keys:
 
     Args:
         file: file of the calibration.
-        data: values by their names in the file.
-        folded: spellings without the mark of the camera (left, 1, ...), by names in the file; None for `fold` of each.
-        lines: line numbers by names in the file, for messages; None for those of `data`.
+        data: values by name in the file.
+        folded: folded names without the mark of the camera (left, 1, ...), by name in the file; by default with it.
+        lines: line numbers by name in the file, for messages; by default those of `data`.
     """
 
     def __init__(

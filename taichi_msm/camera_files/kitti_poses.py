@@ -9,7 +9,7 @@ COUNT = 12
 
 
 def _read(file: CameraFile) -> Trajectory | None:
-    """Read the matrices; None for another format, unless the first line has twelve numbers."""
+    """Read the matrices; None for another format, without twelve numbers in the first line."""
     lines = [(n, line.split()) for n, line in enumerate(file.text.splitlines(), 1)]
     lines = [(n, words) for n, words in lines if words and not words[0].startswith("#")]
     if not lines or len(lines[0][1]) != COUNT or parse_numbers(lines[0][1]) is None:

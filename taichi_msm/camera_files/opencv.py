@@ -15,41 +15,54 @@ from taichi_msm.camera_files.key_lookup import ROUNDING_TOLERANCE, Keys, fold
 from taichi_msm.errors import truncate
 from taichi_msm.lenses import MODELS
 
-# Spellings of a key, reduced to lower-case letters and digits.
+# Spellings of the keys, reduced to lower-case letters and digits; with examples.
 _PICTURE = "(image|img|picture|frame|camera|cam)"
+# K, mtx, camera_matrix, intrinsics
 MATRIX = (
     r"mtx|[km]|kmat(rix)?|intrinsics?(mat|matrix)?(mtx)?|"
     r"(camera|cam|calibration)(mat|matrix|mtx|k|intrinsics?)(mtx|matrix)?"
 )
+# D, dist, distortion_coefficients
 COEFFICIENTS = (
     r"(camera|cam|lens)?(d|dist|distort|distortion)"
     r"(s|coeff?s?|coefficients?|params?|parameters?|vec|vector|mat|matrix|values)?"
 )
+# image_width, image_height; image_size, resolution
 WIDTH, HEIGHT = f"{_PICTURE}?(width|w)", f"{_PICTURE}?(height|h)"
 SIZE = f"{_PICTURE}?(size|resolution|res|dims?)"
+# distortion_model, lens_type; of these, keys whose value may also be the type of a device
 LENS = r"(camera|cam|lens|distortion|dist|projection|calibration|calib)?(model|type)(name|type)?|lens|projection"
 LENS_OR_DEVICE = r"lens|type|projection"
+# is_fisheye
 FISHEYE = r"(is|use)?fisheye(model)?"
+# R, rotation_matrix; T, tvec
 ROTATION = r"r|rot|rotation|rmat|(rot|rotation)(mat|matrix)"
 TRANSLATION = r"t|tvec|trans|translation|(trans|translation)(vec|vector)"
 
-# Unsupported keys that could change the projection: an error unless empty or 0.
-UNSUPPORTED = (
-    r".*(distort(?!ed)|distorsion|coef|radial|tangential|prism|fisheye|omni|mirror|polynom|skew).*|kc|[kps][1-6]|"
-    rf"(?!new|opt).*(cameramat|intrinsic).*|{_PICTURE}?(shape|dimensions?)|"
-    rf"{_PICTURE}(size|resolution|width|height).*|alpha|beta|lambda|(lens|dist).*model.*|"
-    r"binning|scale(factor)?|undistort(ed)?|rectified|roi|crop(ped|[xywh])?|offset[xy]|alphac|tau[xy]?|tilt.*|calibration"
+# Other keys that could change the projection; an error unless empty or 0.
+UNSUPPORTED = "|".join(
+    (
+        # Distortion.
+        r".*(distort(?!ed)|distorsion|coef|radial|tangential|prism|fisheye|omni|mirror|polynom|skew).*",
+        r"(lens|dist).*model.*|kc|[kps][1-6]|alpha|beta|lambda|tau[xy]?|tilt.*",
+        # Camera matrix, but not the new or optimal one of rectified pictures.
+        r"(?!new|opt).*(cameramat|intrinsic).*|alphac|calibration",
+        # Size and processing of the pictures.
+        rf"{_PICTURE}?(shape|dimensions?)|{_PICTURE}(size|resolution|width|height).*",
+        r"binning|scale(factor)?|undistort(ed)?|rectified|roi|crop(ped|[xywh])?|offset[xy]",
+    )
 )
 
-# Lens models by their names in files; empty for ambiguous names.
+# Name of a lens in files, and its model; empty for an ambiguous name.
 NO_DISTORTION = "none"
 LENSES = {
     **dict.fromkeys(("pinhole", "perspective", "mono", "monocular"), ""),
     **dict.fromkeys(("plumbbob", "rationalpolynomial", "rational", "radtan", "radialtangential", "opencv"), "pinhole"),
     **dict.fromkeys(("equidistant", "equi", "fisheye", "opencvfisheye", "kannalabrandt", "kannalabrandt4"), "fisheye"),
-    **dict.fromkeys(("omnidir", "omnidirectional", "omni", "unified"), "omnidir"),
+    **dict.fromkeys(("omnidir", "omnidirectional", "omni", "mei", "unified"), "omnidir"),
     **dict.fromkeys(("none", "nodistortion", "undistorted"), NO_DISTORTION),
 }
+# Values of FISHEYE.
 FLAGS = {
     **dict.fromkeys(("1", "true", "yes", "on"), "fisheye"),
     **dict.fromkeys(("0", "false", "no", "off"), "pinhole"),
@@ -81,12 +94,16 @@ def read_camera(keys: Keys) -> Calibration:
         fault = f"{listed(names)}: unknown, and may change the projection"
         raise keys.fault(f"{fault}; found {keys}; {_REMEDY}, or remove the keys that do not matter", names[0])
     model, values = ("pinhole", []) if model == NO_DISTORTION else (model, values or [])
-    lens = _coefficients(keys, model, [*xi, *values] if model == "omnidir" else values)
+    if model == "omnidir":
+        if not xi:
+            raise keys.fault("an omnidirectional lens without xi; add xi", keys.find(COEFFICIENTS))
+        values = [*xi, *values]
+    lens = _coefficients(keys, model, values)
     return Calibration((fx, fy), (cx, cy), size, model, lens)
 
 
 def read_pose(keys: Keys) -> StereoPose | None:
-    """Read R and T, keys without the mark of a camera (R1 and R2 belong to a rectification); None without both."""
+    """Read R and T; None if the file has neither. R1 and R2, which have the mark of a camera, are other rotations."""
     unmarked = {name: value for name, value in keys.data.items() if keys.folded[name] == fold(name)}
     shared = Keys(keys.file, unmarked, lines=keys.lines)
     if not shared.values(ROTATION) and not shared.values(TRANSLATION):
@@ -97,7 +114,7 @@ def read_pose(keys: Keys) -> StereoPose | None:
 
 
 def _require_agreement(keys: Keys, focal: Sequence[float], centre: Sequence[float]) -> None:
-    """Require that further keys of focal lengths and principal point agree with the camera matrix."""
+    """Require that other keys of focal lengths and principal point agree with the camera matrix."""
     expected = {"fx": focal[:1], "fy": focal[1:], "cx": centre[:1], "cy": centre[1:]}
     expected |= {"focal(length)?s?|f": focal, "principalpoint|pp|centre|center": centre}
     for spelling, values in expected.items():
@@ -106,30 +123,30 @@ def _require_agreement(keys: Keys, focal: Sequence[float], centre: Sequence[floa
             math.isclose(a, b, rel_tol=ROUNDING_TOLERANCE) for a, b in zip(numbers, values, strict=False)
         ):
             names, found = listed(keys.values(spelling)), ", ".join(f"{number:g}" for number in numbers)
-            raise keys.fault(f"{names}: {found}, unlike the camera matrix; keep one", keys.find(spelling))
+            raise keys.fault(f"{names}: {found} differs from the camera matrix; keep one", keys.find(spelling))
 
 
 def _model(keys: Keys, values: Sequence[float], *, has_xi: bool) -> str:
-    """Return the lens model, or "none" where the file states that; all names of models in the file must agree."""
-    sources = {"omnidir": "xi"} if has_xi else {}  # names of keys by their models
+    """Return the lens model, or "none" for the absence of distortion; all keys of lens models must agree."""
+    sources = {"omnidir": "xi"} if has_xi else {}  # for each model, a key that names it
     for name, value in keys.values(LENS).items():
         model = LENSES.get(fold(value))
         if model is None:
             if re.fullmatch(LENS_OR_DEVICE, keys.folded[name]):
-                continue  # A type of device, not of lens.
+                continue  # The type of a device.
             known = "plumb_bob, radtan, rational_polynomial, equidistant, fisheye, omnidir, none"
             raise keys.fault(f"{name}: {truncate(str(value))} is not supported; expected one of: {known}", name)
         if model == NO_DISTORTION and any(values):
             coefficients = ", ".join(f"{number:g}" for number in values)
-            remedy = "write the model of these, such as plumb_bob or equidistant, or zeros"
-            raise keys.fault(f"{name}: {value}, and coefficients that are not 0: {coefficients}; {remedy}", name)
+            remedy = "write their model, such as plumb_bob or equidistant, or zeros"
+            raise keys.fault(f"{name}: {value}, but the coefficients are not 0: {coefficients}; {remedy}", name)
         sources |= {model: name} if model else {}
     for name, value in keys.values(FISHEYE).items():
         if (flag := fold(value)) not in FLAGS:
             raise keys.fault(f"{name}: {truncate(str(value))} is neither true nor false; write one of them", name)
         sources[FLAGS[flag]] = name
     if {"omnidir", NO_DISTORTION} & sources.keys():
-        sources.pop("pinhole", None)  # Files of these may name pinhole as well.
+        sources.pop("pinhole", None)  # Files with these models may also name pinhole.
     if len(sources) > 1:
         (model, name), (model_2, name_2), *_ = sources.items()
         raise keys.fault(f"{name} is {model}, {name_2} is {model_2}; keep the right one", name_2)
@@ -137,23 +154,23 @@ def _model(keys: Keys, values: Sequence[float], *, has_xi: bool) -> str:
 
 
 def _coefficients(keys: Keys, model: str, values: Sequence[float]) -> dict[str, float]:
-    """Return the coefficients of a lens model by their names; trailing ones may be missing."""
+    """Return the coefficients of a lens model by their names; the last ones may be missing."""
     names = tuple(MODELS[model].coefficients)
-    if len(values) not in ((0, 4, 5, 8, 12, 14) if model == "pinhole" else (len(names),)):
-        expected = "4, 5, 8, 12 or 14: k1, k2, p1, p2, k3, ..." if model == "pinhole" else f"those of {model}: "
-        expected += "" if model == "pinhole" else ", ".join(names)
+    counts, expected = [len(names)], f"those of {model}: {', '.join(names)}"
+    if model == "pinhole":
+        counts, expected = [0, 4, 5, 8, 12, 14], "4, 5, 8, 12 or 14: k1, k2, p1, p2, k3, ..."
+    if len(values) not in counts:
         raise keys.fault(f"{len(values)} distortion coefficients; expected {expected}", keys.find(COEFFICIENTS))
-    # Thin prism and tilt, which follow k6.
-    if any(values[8:]):
-        number = next(n for n, value in enumerate(values, 1) if n > 8 and value)
-        fault = f"distortion coefficient {number} is not 0"
+    # Thin prism and tilt follow the 8 coefficients of the model.
+    if others := [n for n, value in enumerate(values, 1) if n > 8 and value]:
+        fault = f"distortion coefficient {others[0]} is not 0"
         remedy = "thin prisms and tilted sensors are not modelled, calibrate without"
         raise keys.fault(f"{fault}; {remedy}", keys.find(COEFFICIENTS))
     return dict(zip(names, values, strict=False))
 
 
 def _size(keys: Keys) -> tuple[int, int] | None:
-    """Return the width and height of the pictures [px], or None if the file does not contain them."""
+    """Return the width and height of the pictures [px]; None if the file has no size."""
     width, height, both = (keys.numbers(spelling) for spelling in (WIDTH, HEIGHT, SIZE))
     if bool(width) != bool(height):
         name = keys.find(WIDTH) or keys.find(HEIGHT)
@@ -165,7 +182,7 @@ def _size(keys: Keys) -> tuple[int, int] | None:
         name = keys.find(SIZE) or keys.find(WIDTH)
         raise keys.fault(f"its size is {text}; write one [width, height] of the pictures", name)
     size = (round(sizes[0][0]), round(sizes[0][1])) if sizes else None
-    # ROS may bin or crop pictures, while its camera matrix remains that of the full picture.
+    # In ROS, pictures may be binned or cropped, and the camera matrix is that of the full picture.
     regions = keys.values("roi", dict)
     faults = [name for name, value in keys.values("binning[xy]").items() if value not in (0, 1)]
     for name, region in regions.items():

@@ -21,7 +21,7 @@ MARKS = (
 
 
 def _cameras(file: CameraFile) -> Sequence[Keys]:
-    """Return the keys of each camera and those without a mark; an empty list unless both cameras have a matrix."""
+    """Return the keys of each camera, with those without a mark; an empty list if a camera has no matrix."""
     data = _flatten_sections(file.data)
     for marks in MARKS:
         sides = [_strip_mark(data, mark) for mark in marks]
@@ -34,10 +34,10 @@ def _cameras(file: CameraFile) -> Sequence[Keys]:
 
 
 def _pose(keys: Keys) -> StereoPose | None:
-    """Read R and T. Keys that could state another unit or pose are an error."""
+    """Read R and T; unknown keys that may define another unit or pose are an error."""
     if names := keys.unread(r"units?|[rt]c?m+|rt|extrinsics?"):
-        fault = f"{listed(names)}: not understood; write R, 3 x 3, and T, 3 numbers"
-        raise keys.fault(f"{fault}, in metres, or set calibration_unit: mm, and remove these", names[0])
+        remedy = "write R (3 x 3) and T (3 numbers) in metres, or set calibration_unit: mm, and remove the unknown keys"
+        raise keys.fault(f"{listed(names)}: unknown; {remedy}", names[0])
     return read_pose(keys)
 
 
@@ -56,7 +56,7 @@ def _flatten_sections(data: Entries) -> Entries:
 
 
 def _strip_mark(keys: Iterable[str], mark: str) -> dict[str, str]:
-    """Return the keys that have a mark; folded names without the mark, by key."""
+    """Return the folded names without the mark, by key, of the keys that have it."""
     matches = {key: re.fullmatch(mark, str(key)) for key in keys}
     return {key: fold("".join(filter(None, match.groups()))) for key, match in matches.items() if match}
 

@@ -39,7 +39,7 @@ def read_calibration(
     Args:
         path: path of the file.
         eye: camera of a stereo pair; right includes its pose.
-        unit: unit of lengths in the file; None for that of the format, else metres.
+        unit: unit of lengths in the file; by default that of the format, or metres if the format has none.
 
     Returns:
         The calibration, lengths in metres.
@@ -74,7 +74,7 @@ class PoseKeys(NamedTuple):
 
     poses_unit: str | None = None  # unit of lengths, m or mm
     poses_time: str | None = None  # unit of times, s, ms, us or ns
-    # Time in the file at which the scene begins [s]; below the first time, counted from the first pose.
+    # Time in the file at which the scene begins [s]; a time before the first pose counts from that pose.
     poses_start: float | None = None
     poses_rate: float | None = None  # poses per second of a file without times
 
@@ -128,8 +128,8 @@ def _times(file: CameraFile, trajectory: Trajectory, keys: PoseKeys) -> list[flo
     if (start := keys.poses_start) is None:
         return times
     if start > times[-1]:
-        times_text = f"{times[0]:.15g} s to {times[-1]:.15g} s"
-        raise file.fault(f"poses_start: {start:.15g} s is after its poses, at {times_text}; take a time of these")
+        remedy = f"take a time from {times[0]:.15g} s to {times[-1]:.15g} s"
+        raise file.fault(f"poses_start: {start:.15g} s is after the last pose; {remedy}")
     # A time before the first pose counts from that pose. Differences of large times are rounded to their resolution.
     is_after_first = start >= times[0] or math.isclose(start, times[0], abs_tol=1e-9)
     origin, digits = start if is_after_first else times[0] + start, int(-math.log10(math.ulp(times[-1])))
@@ -137,7 +137,7 @@ def _times(file: CameraFile, trajectory: Trajectory, keys: PoseKeys) -> list[flo
 
 
 def _agreed_unit(file: CameraFile, key: str, value: str | None, found: str | None) -> str | None:
-    """Return the unit from a key of the camera or from the header of the file; None without both."""
+    """Return the unit in a key of the camera, or in the header of the file; None if both are missing."""
     if value is not None and found is not None and value != found:
         raise file.fault(f"its header has {found}, and {key} is {value}; keep the right one")
     return value if value is not None else found

@@ -10,7 +10,7 @@ from taichi_msm.camera_files.camera_file import CameraFile, Entries, listed
 from taichi_msm.camera_files.key_lookup import Keys
 from taichi_msm.camera_files.opencv import read_camera, read_pose
 
-# OpenCV's keys, each with those of a section for it.
+# Keys of a section that make up each key of OpenCV.
 KEYS = {
     "intrinsics": ("fc_x", "fc_y", "cc_x", "cc_y"),
     "D": ("kc_0", "kc_1", "kc_2", "kc_3"),

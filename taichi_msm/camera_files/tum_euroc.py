@@ -101,7 +101,7 @@ def _columns(file: CameraFile, line: int, names: Sequence[str]) -> _Columns:
 def _row(
     file: CameraFile, line: int, words: Sequence[str], columns: _Columns | None, *, separated: bool
 ) -> list[float]:
-    """Convert the words of a line to a pose; `separated` is whether commas were between them."""
+    """Convert the words of a line to a pose; `separated`: whether by commas."""
     expected = columns or TUM
     numbers = parse_numbers(words)
     if numbers is None or len(numbers) != expected.column_count:

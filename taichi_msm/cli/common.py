@@ -1,4 +1,4 @@
-"""Exit codes, directories, interruption and error messages shared by the commands."""
+"""Exit codes, result directories, interruption and error messages of all commands."""
 
 from __future__ import annotations
 
@@ -18,6 +18,7 @@ from taichi_msm.system.process import Interruption, write_stderr
 # Exit codes; FILES: files cannot be read or written.
 DONE, BUG, INVALID_INPUT, DIVERGED, FILES = 0, 1, 2, 3, 4
 
+# Exit code by the status of a run.
 EXIT_CODES = {"complete": DONE, "diverged": DIVERGED}
 
 
@@ -25,8 +26,8 @@ def result_directory(out: str | None, default: str = "", option: str = "--out") 
     """Return the directory of results: the value of an option, or a default in output/.
 
     Args:
-        out: value of the option; None if it is not given.
-        default: name of the default directory.
+        out: value of the option; None for the default.
+        default: name of the default directory within output/.
         option: name of the option, for messages.
 
     Raises:
@@ -34,7 +35,7 @@ def result_directory(out: str | None, default: str = "", option: str = "--out") 
         FilesError: when the path of the default directory has a symbolic link.
     """
     if out == "":
-        raise click.BadParameter("is empty; name a directory", param_hint=option)
+        raise click.BadParameter("is empty; give a directory", param_hint=option)
     if out is not None:
         return Path(out)
     if default in (".", ".."):
@@ -43,7 +44,7 @@ def result_directory(out: str | None, default: str = "", option: str = "--out") 
 
 
 def resume_hint(directory: Path) -> str:
-    """Return the command that continues the unfinished run in a directory; empty if there is no such run."""
+    """Return a hint with the command that continues the unfinished run in a directory; empty without one."""
     from taichi_msm.runs.checkpoint import is_unfinished
 
     if not is_unfinished(directory):
@@ -63,7 +64,7 @@ def add_resume_hint(directory: Path) -> Iterator[None]:
 
 @contextmanager
 def prefix_errors(scene: str) -> Iterator[None]:
-    """Prefix scene errors with the name of the scene, like the errors of loading."""
+    """Prefix the scene errors of the block with the name of the scene, as in errors of loading."""
     try:
         yield
     except SceneError as error:
@@ -75,18 +76,18 @@ def show_progress(interruption: Interruption, quiet: bool) -> Iterator[Callable[
     """Show the progress of the block.
 
     Args:
-        interruption: signal handler, active from the first stage.
+        interruption: signal handler, which starts to listen at the first stage.
         quiet: whether to show nothing.
 
     Yields:
-        A callback for the stage, the finished and the total number of items; it raises KeyboardInterrupt after an
+        A callback for the stage, and the finished and total number of its items; raises KeyboardInterrupt after an
         interruption.
     """
     from taichi_msm.cli.console import ProgressDisplay
 
     def progress(stage: str, done: int, total: int) -> None:
         bar.update(stage, done, total)
-        # Before the first stage, a signal ends the process at once; the stage "write" is never interrupted.
+        # Until the first stage, a signal ends the process at once. The stage "write" cannot be interrupted.
         interruption.listen()
         if stage != "write":
             interruption.raise_if_requested()
@@ -97,18 +98,18 @@ def show_progress(interruption: Interruption, quiet: bool) -> Iterator[Callable[
 
 @contextmanager
 def report_interruption(interruption: Interruption, as_json: bool, rest: Callable[[], str]) -> Iterator[None]:
-    """Report an interruption of the block, and exit.
+    """Turn a KeyboardInterrupt of the block into a message and an exit.
 
     Args:
-        interruption: interruption with the exit code.
+        interruption: signal handler, with the exit code.
         as_json: whether to print the message as JSON, too.
-        rest: returns the end of the message.
+        rest: returns the end of the message after "interrupted".
 
     Yields:
-        None, once.
+        None.
 
     Raises:
-        click.exceptions.Exit: after a KeyboardInterrupt of the block, which it replaces.
+        click.exceptions.Exit: in place of the KeyboardInterrupt.
     """
     try:
         yield
@@ -124,13 +125,13 @@ def interruptible(
     interruption: Interruption | None = None,
     rest: Callable[[], str] = lambda: "; nothing was written",
 ) -> Iterator[Callable[[str, int, int], None]]:
-    """Show the progress of the block; report an interruption, and exit.
+    """Show the progress of the block, with `show_progress` and `report_interruption`.
 
     Args:
-        as_json: whether the command prints JSON, and thus no progress.
+        as_json: whether the command prints JSON, and so no progress.
         quiet: whether to show no progress.
-        interruption: by default a new one.
-        rest: returns the end of the message of an interruption.
+        interruption: signal handler; by default a new one.
+        rest: returns the end of the message after "interrupted".
 
     Yields:
         The callback of `show_progress`.
@@ -141,7 +142,7 @@ def interruptible(
 
 
 def print_json(value: Any) -> None:
-    """Print one JSON object."""
+    """Print a JSON object on stdout."""
     click.echo(json.dumps(value, indent=2, allow_nan=False))
 
 
@@ -149,9 +150,9 @@ def report_failure(status: str, lines: Sequence[str], as_json: bool) -> None:
     """Print the failure of a command on stderr.
 
     Args:
-        status: error, diverged or interrupted, for JSON.
-        lines: the message.
-        as_json: whether to print it as a JSON object on stdout, too.
+        status: error, diverged or interrupted; for JSON.
+        lines: lines of the message.
+        as_json: whether to print the message as a JSON object on stdout, too.
     """
     write_stderr(lines)
     if as_json:

@@ -1,4 +1,4 @@
-"""Console output of a run: its progress, and a summary at the end."""
+"""Console output: progress of all commands, and summary of a run."""
 
 from __future__ import annotations
 
@@ -16,6 +16,7 @@ from taichi_msm.system.process import write_stderr
 if TYPE_CHECKING:
     from rich.progress import Progress as Bar
 
+# Stages of computations, and their descriptions.
 STAGES = {
     "start": "starting",
     "pilot": "companion runs",
@@ -55,7 +56,7 @@ class ProgressDisplay:
             self._task = self._bar.add_task(STAGES["start"], total=None, left="")
 
     def update(self, stage: str, done: int, total: int) -> None:
-        """Show the progress of a stage, and its estimated remaining time.
+        """Show the progress and the estimated remaining time of a stage.
 
         Args:
             stage: key of `STAGES`.
@@ -87,7 +88,7 @@ class ProgressDisplay:
 
 
 class _Pace:
-    """Rate of progress since the beginning of a stage."""
+    """Rate of progress in a stage."""
 
     def __init__(self, stage: str, done: int, now: float) -> None:
         self.stage, self.done = stage, done
@@ -95,7 +96,7 @@ class _Pace:
         self._last = now
 
     def remaining_s(self, done: int, total: int, now: float) -> float | None:
-        """Estimate the remaining time of the stage [s]; None if unknown or finished."""
+        """Record progress at a time [s]; return the estimated remaining time [s], None if unknown or finished."""
         if done > self.done:
             self._last, self.done = now, done
         if done == self._initially_done or done >= total:
@@ -120,10 +121,11 @@ def run_summary(record: Mapping[str, Any], directory: Path) -> str:
         directory: directory of the results.
 
     Returns:
-        Lines for the terminal, as one text.
+        Text for the terminal.
     """
     times, (rows, cols) = record["timings"], record["points"]
-    stages = ", ".join(f"{stage} {seconds:.2f}" for stage, seconds in times.items() if stage != "total")
+    named = {"companion runs" if stage == "pilot" else stage: seconds for stage, seconds in times.items()}
+    stages = ", ".join(f"{stage} {seconds:.2f}" for stage, seconds in named.items() if stage != "total")
     parallel = times["encode"] > 0 and record["threads"] > 1
     steps = (
         f"at rest to {record['residual']:.1g} of the largest force, {record['evaluations']} evaluations of the forces"

@@ -45,7 +45,7 @@ def example(name: str | None, directory: str) -> None:
 
 
 def scenes_folder() -> Path:
-    """Return the folder of the shipped scenes: within the package of a wheel, or next to that of a source tree."""
+    """Return the folder of the shipped scenes: in the package if installed from a wheel, next to it in a clone."""
     package = Path(__file__).parent.parent
     return next(folder for folder in (package / "scenes", package.parent / "scenes") if folder.is_dir())
 
@@ -57,13 +57,13 @@ def _content(path: Path) -> Any:
 
 
 def _summary(path: Path) -> str:
-    """Return the first sentence of the comment at the beginning of a scene."""
+    """Return the first sentence of the comment at the head of a scene file."""
     lines = re.match("(#.*\n)+", path.read_text(encoding="utf-8"))
     return re.split(r"[:;] |(?<=[.?]) (?=[A-Z])", " ".join(lines[0].replace("#", "").split()))[0] if lines else ""
 
 
 def _files(path: Path) -> Iterator[Path]:
-    """Yield a shipped file and, recursively, the files whose names or patterns it contains."""
+    """Yield a shipped file and, recursively, the files that it names, also by patterns."""
     yield path
     if path.suffix == ".yaml":
         for text in _texts(_content(path)):
@@ -80,7 +80,7 @@ def _texts(value: Any) -> Iterator[str]:
 
 
 def _require_free(path: Path, target: Path, is_scene: bool) -> None:
-    """Raise a FilesError if the target exists; files other than the scene may exist with equal content."""
+    """Raise a FilesError if a target exists; a file other than the scene may exist with equal content."""
     with writing(target, "DIR"):
         if target.is_symlink() or (target.exists() and (is_scene or target.read_bytes() != path.read_bytes())):
             raise FilesError(f"{target}: exists already; move it away or choose another DIR")

@@ -26,7 +26,7 @@ from taichi_msm.exports.formats import FORMATS
     metavar="DIR2",
     help="Directory for the files.  [default: DIR/export-FORMAT; of several DIR, output/export-FORMAT]",
 )
-@click.option("--camera", metavar="NAME", help="Of runs with several cameras, the one whose files are taken.")
+@click.option("--camera", metavar="NAME", help="Camera whose files are exported, of runs with several cameras.")
 @click.option("--quiet", is_flag=True, help="Print no progress and no summary.")
 @options.json_option
 def export(

@@ -15,7 +15,7 @@ from taichi_msm.errors import DivergedError, printable
 @options.scene_argument
 @click.argument("observed", metavar="OBSERVED")
 @click.argument("more", metavar="", nargs=-1)
-@click.option("--free", metavar="KEY ...", multiple=True, help="Fitted parameters of the scene, by dotted path.")
+@click.option("--free", metavar="KEY ...", multiple=True, help="Parameters to fit: keys of the scene, by dotted path.")
 @click.option("--bounds", metavar="KEY=LOW,HIGH ...", multiple=True, help="Smallest and largest value of a parameter.")
 @options.set_option
 @click.option(
@@ -26,7 +26,7 @@ from taichi_msm.errors import DivergedError, printable
 @click.option("--sigma", type=float, metavar="SIGMA", help="Standard deviation of the observations [m] or [px].")
 @click.option("--robust", is_flag=True, help="Reduce the weight of outliers.")
 @click.option(
-    "--correlation", type=float, metavar="PX", help="Correlation length of the errors of tracks in the picture [px]."
+    "--correlation", type=float, metavar="PX", help="Correlation length of the errors of tracks in a picture [px]."
 )
 @click.option("--drift", type=float, metavar="SECONDS", help="Correlation time of the errors of a track [s].")
 @click.option("--profile", is_flag=True, help="Compute intervals by profile likelihood; takes more runs.")
@@ -34,13 +34,19 @@ from taichi_msm.errors import DivergedError, printable
 @click.option("--columns", metavar="NAME=COLUMN", multiple=True, help='Of tables: a column, as "depth=Traverse, mm".')
 @click.option("--sheet", metavar="SHEET", help="Of tables: sheet of a workbook.")
 @click.option("--block", type=int, metavar="N", help="Of tables: block of rows in a file, from 1.")
-@click.option("--window", metavar="T0,T1", help="Of tables: first and last time that are used [s].")
-@click.option("--rate", type=float, metavar="RATE", help="Of tables: frames per second.  [default: 10, 200 in all]")
+@click.option("--window", metavar="T0,T1", help="Of tables: first and last time to use [s].")
 @click.option(
-    "--contact", type=float, metavar="DEPTH", multiple=True, help="Of tables: depth of contact [m], once or per table."
+    "--rate", type=float, metavar="RATE", help="Of tables: frame rate [1/s].  [default: 10, less above 200 frames]"
+)
+@click.option(
+    "--contact",
+    type=float,
+    metavar="DEPTH",
+    multiple=True,
+    help="Of tables: depth at contact [m], one for all or each.",
 )
 @click.option("--out", metavar="DIR", help="Directory for the fit.  [default: output/<name of the scene file>-fit]")
-@options.workers_option(help="Number of worker processes.  [default: by the duration of the first run]")
+@options.workers_option(help="Number of worker processes.  [default: chosen by the duration of the first run]")
 @options.json_option
 def fit(
     scene: str,
@@ -63,7 +69,7 @@ def fit(
     from taichi_msm.fitting.machine_model import is_table
     from taichi_msm.load.scene_file import load_scene
 
-    # --free, --bounds and OBSERVED accept several words; click assigns all but the first to `more`.
+    # --free, --bounds and OBSERVED accept several words; click collects all but the first in `more`.
     tables = [observed, *(word for word in more if is_table(word))]
     more = tuple(word for word in more if not is_table(word))
     limits: dict[str, tuple[float, float]] = {}
@@ -90,7 +96,7 @@ def fit(
                 **settings,
             )
     except DivergedError as error:
-        common.report_failure("diverged", [f"{scene}: where the search begins: {error}"], as_json)
+        common.report_failure("diverged", [f"{scene}: at the initial values of the search: {error}"], as_json)
         return common.DIVERGED
     if as_json:
         common.print_json({"directory": str(directory), **result.as_json()})

@@ -66,4 +66,4 @@ def _run(words: list[str]) -> tuple[int, Sequence[str]]:
         if message := out_of_memory(error):
             return common.INVALID_INPUT, [f"taichi-msm: {message}"]
         message = f"a bug: {type(error).__name__}: {' '.join(str(error).split())}"
-        return common.BUG, [f"taichi-msm: {message}; please report it with what TAICHI_MSM_TRACEBACK=1 prints"]
+        return common.BUG, [f"taichi-msm: {message}; please report it, with the output of TAICHI_MSM_TRACEBACK=1"]

@@ -13,7 +13,7 @@ from taichi_msm.version import __version__
 
 
 class SuggestingChoice(click.Choice):  # type: ignore[type-arg]  # not generic before click 8.2
-    """Option type with a fixed set of words; errors suggest the nearest one."""
+    """Option type with a fixed set of words; its errors suggest the nearest word."""
 
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> str:
         """Validate a word; see `click.ParamType.convert`.
@@ -27,7 +27,7 @@ class SuggestingChoice(click.Choice):  # type: ignore[type-arg]  # not generic b
             The word.
 
         Raises:
-            click.BadParameter: when the word is not in the set; suggests the nearest one.
+            click.BadParameter: when the word is not in the set.
         """
         try:
             return str(super().convert(value, param, ctx))
@@ -37,27 +37,27 @@ class SuggestingChoice(click.Choice):  # type: ignore[type-arg]  # not generic b
 
 
 def parse_shard(text: str) -> tuple[int, int]:
-    """Parse I/N, part I of N counted from 1."""
+    """Parse I/N: shard I of N, counted from 1."""
     numbers = re.fullmatch("([0-9]{1,9})/([0-9]{1,9})", text)
     if numbers is None or not 1 <= int(numbers[1]) <= int(numbers[2]):
-        raise click.BadParameter(f"{text} is not a part; take I/N with 1 <= I <= N, such as 3/8")
+        raise click.BadParameter(f"{text} is not a shard; take I/N with 1 <= I <= N, such as 3/8")
     return int(numbers[1]), int(numbers[2])
 
 
 scene_argument = click.argument("scene", metavar="SCENE")
-image_option = click.option("--image", metavar="FILE", help="The picture on the sheet, instead of the scene's.")
+image_option = click.option("--image", metavar="FILE", help="Picture on the sheet, instead of the scene's.")
 quality_option = click.option(
     "--quality",
     type=click.IntRange(1, 100),
     metavar="N",
-    help="Quality of the film, with output: mp4 [%]; 65 by default.",
+    help="Quality of the MP4 film [%].  [default: 65]",
 )
 set_option = click.option(
     "--set",
     "overrides",
     metavar="KEY=VALUE",
     multiple=True,
-    help="Override a key of the scene by its dotted path, e.g. sheet.points=[61,61]; list items by index.",
+    help="Override a key of the scene, by its dotted path with indices of list items, as probes.0.radius=0.01.",
 )
 arch_option = click.option(
     "--arch", metavar="cpu|cuda|vulkan", default="cpu", show_default=True, help="Device to compute on."
@@ -84,4 +84,4 @@ def _print_version(context: click.Context, _option: click.Parameter, requested: 
     "--version", is_flag=True, is_eager=True, expose_value=False, callback=_print_version, help="Print the versions."
 )
 def program() -> None:
-    """Deform an image as tissue deforms."""
+    """Simulate the deformation of soft tissue that carries a picture."""

@@ -30,10 +30,10 @@ if TYPE_CHECKING:
 @click.option(
     "--estimate-error/--no-estimate",
     default=None,
-    help="Always or never estimate the error.  [default: if that takes at most two fifths of the run]",
+    help="Estimate the error always or never.  [default: if it takes at most two fifths of the run]",
 )
 @options.quality_option
-@click.option("--resume", metavar="DIR", help="Continue the unfinished run in DIR, instead of running SCENE.")
+@click.option("--resume", metavar="DIR", help="Continue the unfinished run in DIR instead of running SCENE.")
 @click.option("--again", metavar="DIR", help="Repeat the run of DIR/run.json instead of running SCENE.")
 @click.option("--quiet", is_flag=True, help="Print no progress and no summary.")
 @options.json_option
@@ -55,7 +55,7 @@ def run(
 ) -> int:
     """Simulate SCENE, draw its frames and write them."""
     overrides += () if quality is None else (f"render.quality={quality}",)
-    typed = [*overrides, *([f"image={image}"] if image is not None else [])]
+    recorded = [*overrides, *([f"image={image}"] if image is not None else [])]
     if resume is not None:
         _require_no_settings(context, "--resume continues", ("resume", "threads", "quiet", "as_json"))
         directory = common.result_directory(resume, option="--resume")
@@ -70,7 +70,7 @@ def run(
         directory = common.result_directory(again, option="--again")
         earlier = read_run(directory)
         earlier.require_same_pictures(drawn=earlier.scene.draws or "image" in earlier.sha256)
-        plan, typed = check_scene(earlier.scene), earlier.overrides
+        plan, recorded = check_scene(earlier.scene), earlier.overrides
         directory = directory if out is None else common.result_directory(out)
     elif scene is None:
         raise click.MissingParameter(param_hint="'SCENE'", param_type="argument")
@@ -99,7 +99,7 @@ def run(
                 directory,
                 arch=arch,
                 threads=threads,
-                overrides=typed,
+                overrides=recorded,
                 estimate_error=estimate_error,
                 started=START_TIME,
                 progress=progress,
@@ -116,7 +116,7 @@ def run(
 
 
 def _require_no_settings(context: click.Context, action: str, allowed: Sequence[str]) -> None:
-    """Reject all but the allowed options of a command that reuses the settings of an earlier run."""
+    """Raise a UsageError for an option that the settings of an earlier run determine."""
     for option in context.command.params:
         is_given = context.get_parameter_source(str(option.name)) is click.core.ParameterSource.COMMANDLINE
         if is_given and option.name not in allowed:
@@ -130,7 +130,7 @@ def _require_no_settings(context: click.Context, action: str, allowed: Sequence[
 @options.set_option
 @options.json_option
 def check(scene: str, image: str | None, overrides: tuple[str, ...], as_json: bool) -> None:
-    """Validate SCENE and print the steps, time, memory and disk space it needs; compute nothing."""
+    """Validate SCENE, and print the steps, time, memory and disk space that it needs."""
     from taichi_msm.load import cost
     from taichi_msm.load.scene_file import load_plan
     from taichi_msm.model.tool_force import describe_forces, force_warnings, probe_records
@@ -175,9 +175,9 @@ def check(scene: str, image: str | None, overrides: tuple[str, ...], as_json: bo
     import yaml
 
     tolerances = [f"{name}.tolerance" for name in ("sheet", "time") if getattr(loaded, name).tolerance is not None]
-    # Companion runs may refine a scene with a tolerance.
+    # With a tolerance, companion runs may refine the scene.
     more = ", or more" if tolerances else ""
-    longer = f", or longer, as {' and '.join(tolerances)} may ask for more" if tolerances else ""
+    longer = f", or longer, if refined for {' and '.join(tolerances)}" if tolerances else ""
     click.echo(yaml.safe_dump(report["scene"], sort_keys=False, default_flow_style=None), nl=False)
     stepping = (
         f"each at rest{more}, in {grid.precision}"
@@ -198,7 +198,7 @@ def check(scene: str, image: str | None, overrides: tuple[str, ...], as_json: bo
 
 
 def _lock_cost(plan: Plan) -> str:
-    """Describe the shorter step of tissue that locks; an empty string for other tissue."""
+    """Describe by how much locking shortens the stable step of tissue; empty for tissue that does not lock."""
     if plan.material.stiffening is None and plan.material.virtual_stiffening is None:
         return ""
     from taichi_msm.solver.planning import stable_step

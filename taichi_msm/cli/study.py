@@ -34,7 +34,7 @@ if TYPE_CHECKING:
     metavar="ERROR",
     help="Largest error, as a fraction of the largest displacement.  [default: the scene's, or 1e-3]",
 )
-@click.option("--quick", is_flag=True, help="Make fewer and shorter measurements, in a minute instead of several.")
+@click.option("--quick", is_flag=True, help="Make fewer and shorter measurements, in about a minute.")
 @options.json_option
 def study(
     scene: str,
@@ -65,7 +65,7 @@ def study(
         if not results.stepping:
             raise KeyboardInterrupt
     if results.status == "interrupted" and (directory / RECORD_FILE).exists():
-        # A partial study must not replace a complete one.
+        # An interrupted study must not replace a complete one.
         directory = require_no_link(directory / "interrupted", "--out")
     outputs = write_report(results, directory)
     if as_json:
@@ -87,9 +87,9 @@ def study(
 @options.set_option
 @options.arch_option
 @options.threads_option
-@click.option("--play", is_flag=True, help="Let the scene's own probes act as well.")
+@click.option("--play", is_flag=True, help="Let the scene's own probes act, too.")
 @click.option(
-    "--browser", is_flag=True, expose_value=False, help="Show the session on a page in a browser: the default."
+    "--browser", is_flag=True, expose_value=False, help="Show the session on a page in a browser, the default."
 )
 @click.option(
     "--port", type=click.IntRange(0, 65535), metavar="N", help="Port of the page.  [default: a free one]", default=0
@@ -102,9 +102,9 @@ def study(
     "--seconds",
     type=click.FloatRange(min=0, max=3600, min_open=True),
     metavar="N",
-    help="With --record: duration of the film [s], which is recorded without a page.",
+    help="With --record: film without a page, for this time [s].",
 )
-@click.option("--script", metavar="EVENTS", help="With --seconds: events of the film, a YAML file.")
+@click.option("--script", metavar="EVENTS", help="With --seconds: YAML file of events in the film.")
 def view(
     scene: str,
     out: str | None,
@@ -125,9 +125,9 @@ def view(
     if seconds is not None and record is None:
         raise click.UsageError("--seconds N needs --record FILE")
     if script is not None and seconds is None:
-        raise click.UsageError("--script needs --record FILE and --seconds N; otherwise you press with the mouse")
+        raise click.UsageError("--script needs --record FILE and --seconds N: a script drives a film without a page")
     if (port or origins) and seconds is not None:
-        raise click.UsageError("--seconds films without a page; leave out --port and --origin, or --seconds")
+        raise click.UsageError("--seconds films without a page; leave out either --seconds, or --port and --origin")
     if seconds is not None and math.isnan(seconds):
         raise click.BadParameter("nan is not a number of seconds", param_hint="--seconds")
     film = None if record is None else _film_path(record)
@@ -171,7 +171,7 @@ def view(
 
 
 def _film_path(record: str) -> Path:
-    """Check the format of a film; return its path."""
+    """Check the option --record; return its path."""
     from taichi_msm.scene.outputs import PYAV_NOT_INSTALLED, is_pyav_installed
 
     path = Path(record)

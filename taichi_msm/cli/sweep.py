@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from taichi_msm.sweeps.spec import Sweep
     from taichi_msm.sweeps.tables import SweepCost
 
-# Largest number of runs without the option --yes.
+# Largest number of runs that needs no --yes.
 MAX_UNCONFIRMED_RUNS = 10_000
 
 
@@ -23,9 +23,9 @@ MAX_UNCONFIRMED_RUNS = 10_000
 @click.argument("file", metavar="SWEEP")
 @click.option("--out", metavar="DIR", help="Directory for the runs.  [default: output/<name of the sweep file>]")
 @options.workers_option(help="Number of worker processes.  [default: one per core, limited by the memory]")
-@click.option("--dask", metavar="ADDRESS", help="Execute the runs in the workers of a dask scheduler.")
+@click.option("--dask", metavar="ADDRESS", help="Execute the runs in the workers of the dask scheduler at ADDRESS.")
 @click.option(
-    "--shard", type=options.parse_shard, metavar="I/N", help="Execute only part I of N of the runs; write no table."
+    "--shard", type=options.parse_shard, metavar="I/N", help="Execute shard I of N of the runs, without a table."
 )
 @click.option("--dry-run", is_flag=True, help="Print the values of all runs and their cost; run nothing.")
 @click.option("--yes", is_flag=True, help=f"Permit more than {MAX_UNCONFIRMED_RUNS} runs, or more than a day.")
@@ -47,31 +47,33 @@ def sweep(
     from taichi_msm.sweeps.tables import choose_worker_count, cost_line, count_statuses, estimate_cost, summary_lines
 
     if workers is not None and dask is not None:
-        raise click.UsageError("--workers are processes here, and --dask has its own; leave out one of them")
+        raise click.UsageError(
+            "--workers starts processes on this machine, and --dask uses those of a cluster; leave out one of them"
+        )
     loaded = load_sweep(file)
     directory = common.result_directory(out, Path(file).stem)
     cost = estimate_cost(loaded)
-    chosen = choose_worker_count(cost, loaded.runs, workers)
     if dry_run:
         _print_dry_run(loaded, cost, shard or (1, 1), workers, as_json)
         return common.DONE
     if not yes and (loaded.runs > MAX_UNCONFIRMED_RUNS or cost.seconds > 86400):
-        raise click.UsageError(f"{cost_line(loaded.runs, cost, chosen)}; add --yes to start them")
+        worker_count = choose_worker_count(cost, loaded.runs, workers)
+        raise click.UsageError(f"{cost_line(loaded.runs, cost, worker_count)}; add --yes to start them")
     state = begin_sweep(loaded, directory, shard or (1, 1))
     outcomes, missing = state.outcomes, len(state.missing)
     total = len(outcomes) + missing
-    chosen = choose_worker_count(cost, missing, workers)
+    worker_count = choose_worker_count(cost, missing, workers)
     if not as_json:
-        write_stderr([f"{len(outcomes)} of {total} runs have ended before"] if outcomes else [])
-        local_workers = chosen if dask is None else None
+        write_stderr([f"{len(outcomes)} of {total} runs are finished already"] if outcomes else [])
+        local_workers = worker_count if dask is None else None
         write_stderr([cost_line(missing, cost.scaled(missing / loaded.runs), local_workers)] if missing else [])
     files: list[str] = []
     notes: list[str] = []
     try:
         with (
             common.interruptible(as_json, rest=lambda: f"; {_progress_message(len(outcomes), total)}") as progress,
-            # Only runs need a cluster.
-            open_executor(dask if missing else None, chosen.number, state, progress) as executor,
+            # Without missing runs, no cluster is needed.
+            open_executor(dask if missing else None, worker_count.number, state, progress) as executor,
         ):
             for _ in run_missing(state, executor, progress):
                 pass
@@ -98,17 +100,17 @@ def _print_dry_run(loaded: Sweep, cost: SweepCost, shard: tuple[int, int], worke
     (part, parts), values = shard, loaded.values()
     runs = range(part - 1, len(values), parts)
     cost = cost.scaled(len(runs) / len(values))
-    chosen = choose_worker_count(cost, len(runs), workers)
+    worker_count = choose_worker_count(cost, len(runs), workers)
     if as_json:
         rows = {"keys": loaded.keys, "runs": list(runs), "values": [values[run] for run in runs]}
-        common.print_json({**rows, **cost._asdict(), "workers": chosen.number})
+        common.print_json({**rows, **cost._asdict(), "workers": worker_count.number})
         return
     click.echo(csv_line(["run", *loaded.keys]))
     for run in runs:
         click.echo(printable(csv_line([run, *map(format_override, values[run])])))
-    click.echo(cost_line(len(runs), cost, chosen))
+    click.echo(cost_line(len(runs), cost, worker_count))
 
 
 def _progress_message(done: int, total: int) -> str:
-    """Format the progress of an unfinished sweep."""
-    return f"{done} of {total} runs have ended; the same command goes on"
+    """Format the progress of an unfinished sweep, and the remedy."""
+    return f"{done} of {total} runs are finished; the same command continues the sweep"

@@ -61,7 +61,7 @@ def write(sources: Sequence[ExportSource], folder: Path) -> Iterator[list[str]]:
 def _write_forces(run: FinishedRun, number: str, file: TextIO) -> None:
     path = run.result_path("forces")
     with reading(path), path.open(encoding="ascii", newline="") as source:
-        # Lines of a run are shorter than 4096 characters; the limit bounds the memory for an untrusted file.
+        # A run writes lines of less than 4096 characters; the limit bounds the memory that an untrusted file takes.
         rows = csv.reader(iter(partial(source.readline, 4096), ""))
         if tuple(next(rows)) != FORCES_HEADER:
             raise damaged_result(path)
@@ -73,10 +73,9 @@ def _write_forces(run: FinishedRun, number: str, file: TextIO) -> None:
 
 def _write_tracks(run: FinishedRun, number: str, file: TextIO) -> None:
     (pixels, occluded), (coordinates, position) = read_tracks(run), read_track_positions(run)
-    count = len(pixels)
+    count, formats = len(pixels), ["%d", *[FLOAT32_FORMAT] * 4, "%d", *[FLOAT32_FORMAT] * 3]
     for frame, time in enumerate(run.time.tolist()):
-        values = ["%d", *[FLOAT32_FORMAT] * 4, "%d", *[FLOAT32_FORMAT] * 3]
-        line = f"{number},{time!r},{','.join(values)}\n"
+        line = f"{number},{time!r},{','.join(formats)}\n"
         rows = np.column_stack(
             [np.arange(count), coordinates, pixels[:, frame], occluded[:, frame], position[:, frame]]
         )

@@ -6,9 +6,9 @@
     poses_bounds.npy    a row per frame, float64: the matrix [right, up, backward, eye, (height, width, focal length)],
                         shape (3, 5), row by row, from the camera to the world; least and largest depth of the frame
 
-The loaders read integers, and depths, eyes and bounds in one unit: 0.01 mm, or the next power of ten in which the
-depths fit 16 bits. The world axes are those of the first camera, from which EndoNeRF renders its videos, and from which
-rays start in normalised device coordinates. The loaders assume one focal length and a centred principal point.
+Depths are integers. Their unit, also that of eyes and bounds, is 0.01 mm, or if they exceed 16 bits, 0.1 mm, 1 mm and
+so on. The world axes are those of the first camera, where EndoNeRF renders its videos and begins its
+rays in normalised device coordinates. The loaders assume one focal length and a centred principal point.
 
 Source: med-air/EndoNeRF, load_llff.py (`_load_data`, `load_llff_data`) and run_endonerf_helpers.py (`get_rays`) at
 5201b1e; yifliu3/EndoGaussian, scene/endo_loader.py (`load_meta`, `format_infos`, `get_pts_cam`) at d7aad82.
@@ -31,7 +31,7 @@ from taichi_msm.scene.outputs import zero_padded
 
 FORMAT_NAME = "endonerf"
 
-# Smallest unit of length [m], and the largest value of a pixel.
+# Smallest unit of length [m], and largest value of a pixel of a depth.
 MIN_UNIT_M, MAX_VALUE = 1e-5, 65535
 
 # Picture size that EndoGaussian's loader assumes [px].
@@ -81,12 +81,12 @@ def _require_central(camera: Pinhole, size: tuple[int, int], run: FinishedRun) -
     x, y = (camera.centre - np.array(size) / 2).tolist()
     faults = []
     if abs(focal_x / focal_y - 1) > 1e-6:
-        faults.append(f"its focal lengths are {focal_x:g} and {focal_y:g} px")
+        faults.append(f"the focal lengths are {focal_x:g} and {focal_y:g} px")
     # The loaders' principal point is the centre of the pixel to the lower right of the picture's centre.
     if max(abs(x), abs(y)) > 0.5 + 1e-6:
-        faults.append(f"its principal point is {x:g} px to the right of and {y:g} px below the centre")
+        faults.append(f"the principal point is {x:g} px to the right of and {y:g} px below the centre")
     if faults:
-        fault = f"{FORMAT_NAME} needs one focal length and a centred principal point, and {' and '.join(faults)}"
+        fault = f"{FORMAT_NAME} needs one focal length and a centred principal point; {', '.join(faults)}"
         width, height = size[0] / 2, size[1] / 2
         remedy = f"run the scene with fx = fy, cx: {width:g} and cy: {height:g}, or with fov"
         raise ArgumentError(f"{run.directory / run.camera}: {fault}; {remedy}")

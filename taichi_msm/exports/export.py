@@ -39,7 +39,7 @@ from taichi_msm.scene.outputs import OUTPUTS, zero_padded
 
 EXPORT_RECORD = "export.json"
 
-# Files of all formats, as an earlier export may have another format; any other file in the folder is an error.
+# Files of all formats, because the export that is replaced may have another format. Other files are errors.
 EXPORT_PATTERNS = (
     r"export\.json",
     r"index\.csv",
@@ -69,7 +69,7 @@ def export(
     Args:
         runs: folder of a run, or of a sweep, whose complete runs are exported; or a sequence of folders.
         format: kitti, tapvid, tapvid3d, stir, endonerf, rerun, vtk, gltf, obj or csv.
-        out: destination; None for export-FORMAT in the folder of a single run or sweep, or in output for several.
+        out: destination; None for a folder export-FORMAT, in that of a single run or sweep, or in output/ for several.
         progress: called with the finished and the total number of frames; an exception in it cancels the export and
             leaves all files unchanged.
         camera: for runs with several cameras, the name of the camera whose pictures, labels and tracks are exported.
@@ -114,29 +114,27 @@ def export(
 
 
 def _select_cameras(run: FinishedRun, name: str, camera: str | None) -> list[FinishedRun]:
-    """Select the cameras of a run that a format exports; return a copy of the run per camera."""
+    """Return a copy of a run for every camera that a format exports, with this camera selected."""
     export_format, known = FORMATS[name], run.camera_names()
-    exported = export_format.cameras
-    if exported == ANY_CAMERA and camera is not None and camera in known:
+    if export_format.cameras != ANY_CAMERA:
+        if set(export_format.cameras) <= set(known):
+            return [replace(run, camera=camera) for camera in export_format.cameras] or [run]
+        cameras = f"its cameras are {', '.join(known)}" if known else "it has one camera, without a name"
+        fault = f"{name} needs the cameras {' and '.join(export_format.cameras)}; {cameras}"
+        raise FilesError(f"{run.directory}: {fault}; run the scene with `cameras` of these names")
+    if camera is not None and camera in known:
         return [replace(run, camera=camera)]
     outputs = (*export_format.required_outputs, *export_format.optional_outputs)
-    depends_on_camera = any(OUTPUTS[key].is_camera_output and key in run.scene.output for key in outputs)
-    if not exported or (exported == ANY_CAMERA and not (known and depends_on_camera)):
+    if not known or not any(OUTPUTS[key].is_camera_output and key in run.scene.output for key in outputs):
         return [run]
-    cameras = f"its cameras are {', '.join(known)}" if known else "it has one camera, without a name"
-    if exported == ANY_CAMERA:
-        choice, hint = ("none is chosen", "") if camera is None else (repr(camera), did_you_mean(camera, known))
-        raise ArgumentError(f"camera: {choice}; take one of those of {run.directory}: {', '.join(known)}{hint}")
-    if set(exported) <= set(known):
-        return [replace(run, camera=camera) for camera in exported]
-    fault = f"{name} needs the cameras {' and '.join(exported)}; {cameras}"
-    raise FilesError(f"{run.directory}: {fault}; run the scene with `cameras` of these names")
+    choice, hint = ("none is chosen", "") if camera is None else (repr(camera), did_you_mean(camera, known))
+    raise ArgumentError(f"camera: {choice}; take one of those of {run.directory}: {', '.join(known)}{hint}")
 
 
 def _write_export(
     camera_runs: Sequence[Sequence[FinishedRun]], name: str, directory: Path, progress: ProgressCallback
 ) -> Exported:
-    """Write an export atomically; `camera_runs` has the copies of each run from `_select_cameras`."""
+    """Write an export atomically. `camera_runs` has the copies of every run by `_select_cameras`."""
     runs = [run for run, *_ in camera_runs]
     export_format, total, done = FORMATS[name], sum(run.frames for run in runs), 0
     write: FormatWriter = import_module(f"taichi_msm.exports.{export_format.module or name}").write
@@ -165,7 +163,7 @@ def _write_export(
             with _name_run_in_errors(run, name), run.unchanged():
                 for note in next(writer):
                     notes.setdefault(note, []).append(run.directory)
-        next(writer, None)
+        next(writer, None)  # writes the files that combine runs
         _write_index(runs, export_format.numbers_pairs, publication.new_folder / "index.csv")
         written = sorted(list_files(publication.new_folder, EXPORT_PATTERNS, strict=True))
         write_new_file(
@@ -191,7 +189,7 @@ def _name_run_in_errors(run: FinishedRun, name: str) -> Iterator[None]:
         with np.errstate(over="raise", divide="raise", invalid="raise"):
             yield
     except SceneError as error:
-        # The remedy of a SceneError is a change of the scene; here it is to restore the picture.
+        # The remedy of the SceneError, to change the scene, does not apply to a finished run.
         fault = error.lines[0].partition(";")[0]
         raise FilesError(f"{run.directory}: {fault}; {RESTORE_PICTURE}") from None
     except FloatingPointError:

@@ -21,7 +21,7 @@ class Format(NamedTuple):
     required_outputs: tuple[str, ...]  # entries of a scene's `output`
     file_patterns: tuple[str, ...]  # regular expressions, for `list_files`
     optional_outputs: tuple[str, ...] = ()  # further exported entries of `output`
-    numbers_pairs: bool = False  # whether files are numbered by pairs of frames instead of runs
+    numbers_pairs: bool = False  # whether files are numbered by pair of frames, and not by run
     cameras: tuple[str, ...] = ()  # names of the exported cameras, or ANY_CAMERA; empty for a format without camera
     module: str = ""  # name of the module; empty for the name of the format
 
@@ -31,7 +31,7 @@ def _patterns_per_run(*patterns: str) -> tuple[str, ...]:
     return (*patterns, *(f"{NUMBER_PATTERN}/{pattern}" for pattern in patterns))
 
 
-# The camera chosen by the user, or the only one.
+# Value of `Format.cameras` for the camera of the user's choice, or the only one.
 ANY_CAMERA = ("",)
 
 FORMATS = {
@@ -149,7 +149,7 @@ class RunWriter(Protocol):
 
 
 def one_folder_per_run(write: RunWriter) -> FormatWriter:
-    """Return the writer of a format with a folder per run; a single run is in the folder of the export itself."""
+    """Return the writer of a format with a folder per run, or with the files of a single run directly in the export."""
 
     def write_all(sources: Sequence[ExportSource], folder: Path) -> Iterator[list[str]]:
         for run, name, progress in sources:
@@ -178,7 +178,7 @@ def read_runs(directories: Sequence[str | Path]) -> tuple[list[FinishedRun], int
     """Read the records of runs, given as folders of runs or of sweeps.
 
     Returns:
-        The runs, of sweeps the complete ones; and the number of incomplete runs of sweeps.
+        The runs, without the incomplete runs of sweeps; and the number of these.
 
     Raises:
         FilesError: as for `read_run`, and when no run is complete.
@@ -199,5 +199,5 @@ def read_runs(directories: Sequence[str | Path]) -> tuple[list[FinishedRun], int
         incomplete += count - len(complete)
         runs += complete
     if not runs:
-        raise FilesError(f"{', '.join(map(str, directories))}: no run is complete; their table.csv has the reasons")
+        raise FilesError(f"{', '.join(map(str, directories))}: no run is complete; table.csv has the reasons")
     return runs, incomplete

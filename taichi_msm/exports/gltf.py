@@ -4,8 +4,8 @@ The mesh is the surface in the first frame. Every other frame is a morph target:
 from the mesh. In the animation, the weight of a target is 1 at its frame and 0 at the adjacent ones, with linear
 interpolation. Like this package, glTF uses metres, y up, and texture coordinates from the upper left corner.
 
-Browsers store each target in a layer of a texture, and WebGL 2 guarantees 256 layers. Runs that exceed this, or the
-size limit, are reduced to keyframes, and the largest interpolation error is reported.
+Browsers store each target in a layer of a texture, and WebGL 2 guarantees 256 layers. A run with more frames than this,
+or than the size limit permits, is reduced to keyframes, with a warning of the largest interpolation error.
 
 A tool is a mesh of its instrument, which moves with the tip. glTF's cameras look along -z with y up, without lens
 distortion, and with the principal point at the centre.
@@ -82,7 +82,7 @@ write = one_folder_per_run(_write_run)
 def _add_sheet(
     glb: Glb, positions: Array, picture: bytes | None, time: Array, keys: KeyFrames, progress: ProgressCallback
 ) -> None:
-    """Add the mesh of the first frame, its matte material, and its morph targets and their animation."""
+    """Add the mesh of the first frame, its material and morph targets, and their animation."""
     first, normals = refine_surface(positions[0], EXPORT_REFINE), unit_normals(positions[0])
     attributes = glb.attributes(first.vertices, normals)
     if picture is not None:
@@ -261,8 +261,8 @@ class Glb:
         Returns:
             Index of the accessor.
         """
-        kind = np.float32 if values.dtype.kind == "f" else np.uint32
-        rows = np.ascontiguousarray(values, kind).reshape(len(values), -1)
+        dtype = np.float32 if values.dtype.kind == "f" else np.uint32
+        rows = np.ascontiguousarray(values, dtype).reshape(len(values), -1)
         accessor = {
             "bufferView": self.view(rows.data.cast("B"), target),
             "componentType": COMPONENT_TYPES[rows.dtype.kind],
@@ -328,7 +328,7 @@ class Glb:
         animation["samplers"].append(sampler)
 
     def content(self) -> Iterator[bytes | memoryview]:
-        """Yield the parts of the file."""
+        """Yield the bytes of the file in parts."""
         buffers = {"accessors": self._accessors, "bufferViews": self._views, "buffers": [{"byteLength": self._length}]}
         text = json.dumps({**self.document, **buffers}, separators=(",", ":"), allow_nan=False).encode()
         text += _padding(len(text), b" ")

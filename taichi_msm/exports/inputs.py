@@ -19,13 +19,13 @@ from taichi_msm.errors import ArgumentError
 from taichi_msm.exports.formats import ANY_CAMERA, FORMATS
 from taichi_msm.model.surface import Solid, refine_surface
 from taichi_msm.render.texture import load_texture
-from taichi_msm.runs.arrays import read_rows
+from taichi_msm.runs.arrays import read_flo, read_rows
 from taichi_msm.runs.directory import MAX_RECORD_BYTES
 from taichi_msm.runs.finished import FinishedRun, damaged_result, reading
 from taichi_msm.scene.outputs import CAMERA_FILE
 from taichi_msm.system.files import read_regular
 
-# Exported vertices are the mass points: the surface between them is bilinear, so a refinement adds no information.
+# Vertices are the mass points. The surface between them is bilinear: a refinement would add no information.
 EXPORT_REFINE = 0
 
 # Enough digits for any float32.
@@ -119,13 +119,25 @@ def read_depth(run: FinishedRun, frame: int) -> NDArray[np.float32]:
     """
     path = run.result_path("depth", frame)
     with reading(path), Image.open(path, formats=["TIFF"]) as image:
-        # Checked before pixels are decoded, which could take any memory.
+        # Checked before decoding, which could take any amount of memory.
         if image.mode != "F" or image.size != run.scene.render.size:
             raise damaged_result(path)
         depth = np.array(image)
         if not (np.isfinite(depth) & (depth >= 0)).all():
             raise damaged_result(path)
     return depth
+
+
+def read_flow(run: FinishedRun, pair: int) -> NDArray[np.float32]:
+    """Return the optical flow to the right and down [px], shape (height, width, 2).
+
+    Args:
+        run: run with flow, and its camera selected.
+        pair: index of the first of two adjacent frames.
+    """
+    path = run.result_path("flow", pair)
+    with reading(path):
+        return read_flo(path, run.scene.render.size)
 
 
 def read_picture_file(run: FinishedRun, key: str, frame: int) -> bytes:
@@ -144,7 +156,7 @@ def read_picture_file(run: FinishedRun, key: str, frame: int) -> bytes:
 
 Array = NDArray[np.float64]
 
-# Pixel coordinate of the first pixel's centre; it is 0 in OpenCV [px].
+# Coordinate of the first pixel's centre [px]; it is 0 in OpenCV.
 FIRST_PIXEL_CENTRE = 0.5
 
 
@@ -187,7 +199,7 @@ def read_pinhole(run: FinishedRun, name: str) -> Pinhole:
         raise ArgumentError(f"{fault}; {alternative}run the scene with a pinhole camera")
     if is_distorted:
         fault = f"{path}: the camera has lens distortion, which {name} cannot describe"
-        raise ArgumentError(f"{fault}; {alternative}run the scene without it")
+        raise ArgumentError(f"{fault}; {alternative}run the scene without distortion")
     with reading(path):
         matrix = np.array(camera["intrinsics"], float)
         poses = np.array(camera.get("poses", [camera["pose"]] * run.frames), float)[: run.frames]

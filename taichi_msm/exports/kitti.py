@@ -24,10 +24,9 @@ from numpy.typing import NDArray
 
 from taichi_msm.errors import FilesError, ProgressCallback
 from taichi_msm.exports.formats import ExportSource
-from taichi_msm.exports.inputs import read_picture_file
-from taichi_msm.runs.arrays import read_flo
+from taichi_msm.exports.inputs import read_flow, read_picture_file
 from taichi_msm.runs.directory import write_new_file
-from taichi_msm.runs.finished import FinishedRun, reading
+from taichi_msm.runs.finished import FinishedRun
 from taichi_msm.scene.outputs import OUTPUTS, zero_padded
 
 # Folders, each with the entry of `output` that it contains.
@@ -60,17 +59,14 @@ def _write_run(run: FinishedRun, training: Path, first: int, progress: ProgressC
     flow_occ, flow_noc, image_2 = (training / name for name in SOURCE_OUTPUTS)
     for pair in range(pairs):
         progress(pair, pairs)
-        source, name = run.result_path("flow", pair), zero_padded(first + pair)
-        with reading(source):
-            flow = read_flo(source, run.scene.render.size)
+        flow, name = read_flow(run, pair), zero_padded(first + pair)
         write_new_file(flow_occ / f"{name}_10.png", png16(encode_flow(flow)))
         if run.has_output("occlusion"):
-            write_new_file(
-                flow_noc / f"{name}_10.png",
-                png16(encode_flow(flow, ~(run.read_picture("occlusion", pair)[..., 0] > 0))),
-            )
-        for number in (0, 1) if run.has_output("png") else ():
-            write_new_file(image_2 / f"{name}_1{number}.png", read_picture_file(run, "png", pair + number))
+            visible = run.read_picture("occlusion", pair)[..., 0] == 0
+            write_new_file(flow_noc / f"{name}_10.png", png16(encode_flow(flow, visible)))
+        if run.has_output("png"):
+            for number in (0, 1):
+                write_new_file(image_2 / f"{name}_1{number}.png", read_picture_file(run, "png", pair + number))
     remedy = run.remedy("occlusion", "png")
     return [
         f"{name} is left out, as the results have no {OUTPUTS[key].result}; {remedy}"
@@ -89,7 +85,7 @@ def encode_flow(flow: NDArray[np.float32], visible: NDArray[np.bool_] | None = N
     Returns:
         Colours, shape (height, width, 3); 0 where the flow is invalid or out of range.
     """
-    # In double precision, only the final rounding changes the value.
+    # In f32, the sum would be rounded before `rint`.
     scaled = np.rint(flow.astype(np.float64) * 64.0 + 32768.0)
     valid = ((scaled >= 0) & (scaled <= 65535.0)).all(axis=-1)
     if visible is not None:

@@ -1,7 +1,7 @@
 """Rerun export: a recording per run, for the viewer of rerun.io.
 
     world/sheet             mesh of the mass points with the picture of the scene
-    world/tools/0           capsule of the instrument of a probe, by the number of the probe
+    world/tools/0           mesh of the instrument of a probe, by the number of the probe
     world/tracks            positions of the tracked points
     world/camera            pose and pinhole of the camera; world/cameras/NAME for each of several
     world/camera/picture    frames
@@ -30,6 +30,7 @@ from taichi_msm.exports.inputs import (
     EXPORT_REFINE,
     instrument_mesh,
     read_depth,
+    read_flow,
     read_picture_file,
     read_track_positions,
     unit_normals,
@@ -38,8 +39,7 @@ from taichi_msm.model.surface import place_instruments, refine_surface
 from taichi_msm.render.camera import OPENCV_SIGNS, View, calibration, is_moving, view_at
 from taichi_msm.render.labels import NO_FLOW
 from taichi_msm.render.texture import load_texture
-from taichi_msm.runs.arrays import read_flo
-from taichi_msm.runs.finished import FinishedRun, reading
+from taichi_msm.runs.finished import FinishedRun
 from taichi_msm.scene.outputs import OUTPUTS
 
 try:
@@ -50,7 +50,7 @@ except ImportError:
 
 def _write_run(run: FinishedRun, path: Path, progress: ProgressCallback) -> list[str]:
     """Write a recording of a run."""
-    # The viewer merges recordings with the same identity.
+    # The viewer merges recordings with the same identity: here, those of the same folder.
     identity = uuid5(NAMESPACE_URL, run.directory.resolve().as_uri())
     with rerun.RecordingStream("taichi_msm", recording_id=identity) as recording:
         recording.save(path)
@@ -91,7 +91,7 @@ def _log_run(run: FinishedRun, recording: Any, progress: ProgressCallback) -> No
         (read_track_positions(camera_run)[1] for camera_run in camera_runs.values() if camera_run.has_output("tracks")),
         None,
     )
-    # Distinct colours; the hues of successive points are 0.618 turns apart.
+    # Distinct colours: the hues of successive tracks are 0.618 turns apart.
     phase = np.arange(0 if tracks is None else len(tracks))[:, None] * 0.618 + np.array([0, 1 / 3, 2 / 3])
     colours = (127.5 + 127.5 * np.cos(2 * np.pi * phase)).astype(np.uint8)
     instruments = [number for number, probe in enumerate(run.scene.probes) if probe.instrument is not None]
@@ -144,9 +144,7 @@ def _log_pictures(run: FinishedRun, frame: int, entity: str, recording: Any) -> 
     if run.has_output("depth"):
         recording.log(f"{entity}/depth", rerun.DepthImage(read_depth(run, frame), meter=1.0))
     if run.has_output("flow") and frame < OUTPUTS["flow"].count(run.frames):
-        path = run.result_path("flow", frame)
-        with reading(path):
-            flow = read_flo(path, run.scene.render.size)
+        flow = read_flow(run, frame)
         largest = float(np.abs(flow[flow < NO_FLOW / 2]).max(initial=1.0))
         tensor = rerun.Tensor(flow, dim_names=("height", "width", "right and down"), value_range=(-largest, largest))
         recording.log(f"{entity}/flow", tensor)

@@ -8,9 +8,9 @@ Every run has a folder with
     left/seq00/segmentation/icgendseg.png           the same for the last frame
     left/seq00/0ms_icgstart.png, 1200ms_icgend.png  first and last frame
 
-The start and end pictures are visible frames, as infrared pictures show only the tattoos, and the loader matches left
-and right tracks by texture. A track is marked if both cameras see it in the first and last frame, and its disc touches
-no other disc. The centre of a disc is the pixel that contains the track.
+The start and end pictures are frames in visible light, because the loader matches left and right tracks by texture, and
+infrared pictures show only the tattoos. A track is marked if both cameras see it in the first and last frame, and its
+disc touches no other disc. The centre of a disc is the pixel that contains the track.
 
 A position X_left in the axes of the left camera (OpenCV's, [m]) is X_right = `rotation` X_left + `translation` in
 those of the right one: the first component of `translation` is the negative baseline. Camera matrices count from the
@@ -99,7 +99,7 @@ def _calibration(left: Pinhole, right: Pinhole, baseline: float) -> dict[str, An
 
 
 def _report_progress(progress: ProgressCallback, before: int, done: int, total: int) -> None:
-    """Report the progress of a camera as progress of both; `before` cameras are finished."""
+    """Report the progress of a camera as progress of both, of which `before` are finished."""
     progress(before * total + done, len(CAMERAS) * total)
 
 
@@ -110,6 +110,7 @@ def _choose_tracks(runs: Sequence[FinishedRun], radius: int) -> tuple[Pixels, in
         Pixels per camera in the first and last frame, shape (2, 2, tracks, 2); and the number of all tracks.
     """
     tracks, occluded = (np.stack(each)[:, :, [0, -1]] for each in zip(*map(read_tracks, runs), strict=True))
+    # From the axes camera, track, frame, component to camera, frame, track, component.
     pixels = np.floor(np.nan_to_num(tracks)).astype(np.int64).transpose(0, 2, 1, 3)
     inside = ((pixels >= radius) & (pixels < np.array(runs[0].scene.render.size) - radius)).all(axis=(0, 1, 3))
     chosen: list[int] = []

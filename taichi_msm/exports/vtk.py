@@ -105,7 +105,7 @@ def _grid(position: Array, values: dict[str, Array]) -> Element:
 
 
 def _add_array(parent: Element, name: str, array: NDArray[Any]) -> None:
-    """Add an array: a header with the block sizes, then a single compressed block."""
+    """Add an array as a single compressed block, after a header with its sizes."""
     kind, components = f"{TYPES[array.dtype.kind]}{8 * array.itemsize}", str(array[0].size)
     element = SubElement(parent, "DataArray", type=kind, Name=name, NumberOfComponents=components, format="binary")
     content = array.astype(array.dtype.newbyteorder("<")).tobytes()

@@ -46,6 +46,7 @@ def read_observations(observed: str | Path | Mapping[str, Any], rate: float) -> 
     if isinstance(observed, Mapping):
         name, names = "observed", [str(key) for key in observed]
         _require_supported(name, names)
+        # Masked numbers are not observed.
         filled = (np.ma.filled(1.0 * value, np.nan) if np.ma.isMA(value) else value for value in observed.values())
         arrays = {key: as_array(value, key) for key, value in zip(names, filled, strict=True)}
     else:
@@ -150,7 +151,7 @@ def _require_supported(name: str, keys: list[str]) -> None:
     """Raise a SceneError about arrays that are not supported, but whose names suggest observations."""
     ignored = [key for key in keys if key not in MEMBERS and SUGGESTIVE_PARTS.search(key.lower())]
     if ignored:
-        fault = "not supported; take NaN where not observed, or visible or occluded (N, T), and sigma for errors"
+        fault = "not supported; take NaN, visible or occluded (N, T) for missing points, and sigma for errors"
         raise SceneError([f"{name}: {', '.join(map(ascii, ignored))}: {fault}"])
 
 
@@ -168,9 +169,7 @@ def _read_members(name: str, archive: zipfile.ZipFile) -> tuple[Arrays, list[str
                 arrays[key] = np.lib.format.read_array(member, allow_pickle=False)
         except Exception as error:  # Errors of zipfile, its decompressors and NumPy are of any kind.
             reason = "cannot be read: " + (str(error).partition("\n")[0] or type(error).__name__)
-            if info.flag_bits & 1:
-                reason = "cannot be read: encrypted"
-            elif "Object arrays" in reason:
+            if "Object arrays" in reason:
                 reason = "an array of Python objects"
             raise SceneError([f"{name}: {key}: {reason}; write it again by np.savez, as numbers"]) from None
     return arrays, list(infos)

@@ -37,40 +37,40 @@ def faults(observations: Sequence[Observation], scene: Scene, parameters: int) -
 
 
 def faults_at_start(
-    observations: Sequence[Observation], scene: Scene, first: Prediction, parameters: Sequence[Parameter] = ()
+    observations: Sequence[Observation], scene: Scene, initial: Prediction, parameters: Sequence[Parameter] = ()
 ) -> Iterator[str]:
     """Yield the faults found with a run of the initial scene: no motion at the times, another camera or origin, signs.
 
     Args:
         observations: the observations.
         scene: the initial scene.
-        first: prediction of the whole initial scene.
-        parameters: parameters of the fit; a free camera disables checks of the camera, a linear parameter checks of
-            signs.
+        initial: prediction of the initial scene, up to its last frame.
+        parameters: parameters of the fit. A free camera skips the check of the camera; a linear parameter, which may
+            change sign, skips that of signs.
     """
-    rate, motion, name = scene.time.frames_per_second, float(first.motion.max()), observations[0].name
+    rate, motion, name = scene.time.frames_per_second, float(initial.motion.max()), observations[0].name
     if motion <= ROUNDING_SHARE * max(scene.sheet.size):
         yield f"{name}: none of its points moves in the scene; add probes that press near them"
         return
     times = np.concatenate([observed.time for observed in observations])
-    observed_motion = float(np.interp(times * rate, np.arange(len(first.motion)), first.motion).max())
+    observed_motion = float(np.interp(times * rate, np.arange(len(initial.motion)), initial.motion).max())
     if observed_motion < 0.1 * motion:
-        moving = np.flatnonzero(first.motion > 0.5 * motion) / rate
+        moving = np.flatnonzero(initial.motion > 0.5 * motion) / rate
         yield (
             f"{name}: its {len(observations[0].time)} times miss the motion: "
-            f"the scene's points move by up to {1000 * motion:.3g} mm, but by {1000 * observed_motion:.3g} mm then; "
+            f"the scene's points then move by {1000 * observed_motion:.3g} of {1000 * motion:.3g} mm; "
             f"add times between {moving[0]:g} and {moving[-1]:g} s"
         )
         return
     same_camera = not any(parameter.key.startswith("render.") for parameter in parameters)
-    problems = [
+    messages = [
         fault
-        for observed, predicted in zip(observations, first.values, strict=True)
+        for observed, predicted in zip(observations, initial.values, strict=True)
         for fault in observed.faults_at_start(scene, predicted, same_camera=same_camera)
     ]
-    yield from problems
-    if not problems and all(parameter.is_log for parameter in parameters):
-        yield from opposed(observations, scene, first)
+    yield from messages
+    if not messages and all(parameter.is_log for parameter in parameters):
+        yield from opposed(observations, scene, initial)
 
 
 def opposed(observations: Sequence[Observation], scene: Scene, *predictions: Prediction) -> Iterator[str]:

@@ -20,7 +20,6 @@ from taichi_msm.fitting import rejection
 from taichi_msm.fitting.archive import read_observations
 from taichi_msm.fitting.checks import faults, faults_at_start, opposed, unit_faults
 from taichi_msm.fitting.forces import read_forces
-from taichi_msm.fitting.identifiability import MAX_RELATIVE_ERROR, UnidentifiedGroup, unidentified_groups
 from taichi_msm.fitting.least_squares import Misfit, Search, Solution
 from taichi_msm.fitting.machine_curve import CurveRuns, has_curve, search_by_curve
 from taichi_msm.fitting.machine_fit import explanations, fitted_tests, unknown_notes
@@ -33,7 +32,13 @@ from taichi_msm.fitting.profiles import Profile, ProfilePoint, Profiler
 from taichi_msm.fitting.report import publication, write_report
 from taichi_msm.fitting.result import Estimate, FitResult, FittedMap
 from taichi_msm.fitting.stiffness_map import KEY, MapSettings, fit_map, map_settings
-from taichi_msm.fitting.uncertainty import Uncertainty, uncertainty
+from taichi_msm.fitting.uncertainty import (
+    MAX_RELATIVE_ERROR,
+    Uncertainty,
+    UnidentifiedGroup,
+    uncertainty,
+    unidentified_groups,
+)
 from taichi_msm.load.check import check_scene
 from taichi_msm.load.scene_file import load_scene
 from taichi_msm.scene.scene import Scene
@@ -60,21 +65,21 @@ def fit(
             NaN where not observed; optionally `sigma`, the standard deviation of their errors. Or a run's
             trajectory.npz or tracks.npz. Or one or more tables of a testing machine, .csv, .tsv, .txt or .xlsx, with
             time, depth and force, which the scene's only position-controlled tool follows.
-        free: keys of the parameters, as dotted paths such as tissue.young or probes.0.total.2; or tissue.map, a map
-            of R x R cells, alone or with a component of a force, which scales all forces by a common factor. With
-            tables also contact, or contact.0, ... for several: the depth of contact, as in the table [m].
-        bounds: smallest and largest values by key; for tissue.map, of the factors.
+        free: keys of the parameters, dotted paths such as tissue.young or probes.0.total.2. tissue.map is a map of
+            R x R cells; with it one component of a force may be free, and its factor then scales all forces. contact,
+            or contact.0, ... of several tables, is the depth of contact [m of the table].
+        bounds: smallest and largest value by key; for tissue.map the smallest and largest factor.
         forces: a forces.csv of the same motion, and the standard deviation of its forces [N].
         directory: directory for fit.json, scene.yaml, fit.png and a map's pictures; by default none is written.
         workers: number of worker processes; by default chosen by the duration of the first run.
-        progress: called often with the stage, the finished and the expected number of runs; an exception from it ends
-            the fit, and nothing is written.
-        **method: options. For observed points, sigma: standard deviation instead of the file's; robust: whether to
-            downweight outliers; profile: whether to compute profile intervals; correlation: correlation length of the
-            errors of tracks [px]; drift: correlation time of the errors of a track [s]; resolution: R of a map. For
-            tables, columns: selected columns, such as ["depth=Traverse, mm"]; sheet, block: selected
-            sheet and block of a file; window: first and last time [s]; rate: frames per second; contact: depths of
-            contact, as in the tables [m], one for all or one per table.
+        progress: callback for the stage, the number of finished runs and the expected number; an exception from it
+            ends the fit without files.
+        **method: options. Of all fits of numbers: `robust` (lower weight of outliers), `profile` (profile-likelihood
+            intervals). Of points: `sigma` (standard deviation of the errors, replaces that of the file), `correlation`
+            (correlation length of the errors of tracks [px]), `drift` (correlation time of the errors of a track [s]),
+            `resolution` (R of a map). Of tables: `columns` (selected columns, such as ["depth=Traverse, mm"]), `sheet`
+            and `block` of a file, `window` (first and last time [s]), `rate` (frames per second), `contact` (depths of
+            contact [m of the table], one for all tables or one each).
 
     Returns:
         The estimates; `identifiable` is False if the data do not determine a parameter.
@@ -134,9 +139,8 @@ def _read_problem(
     forces: tuple[str | Path, float] | None,
     method: Method,
 ) -> tuple[FitProblem, MapSettings | None]:
-    """Read and check observations of points and forces; return the fit, and the settings of a map or None."""
+    """Return the problem of a fit to points and forces, and the settings of its map, None for a fit of numbers."""
     points = read_observations(observed, initial.time.frames_per_second).with_sigma(method.get("sigma"))
-    observations: tuple[Observation, ...] = (points,)
     if unused := [name for name in TABLE_OPTIONS if method.get(name)]:
         raise SceneError([f"--{unused[0]}: only for tables of a testing machine; leave it out"])
     settings = map_settings(initial, free, bounds, method.get("resolution"))
@@ -144,8 +148,8 @@ def _read_problem(
     if settings is not None and (conflicting := [name for name, value in options.items() if value]):
         raise SceneError([f"--free {KEY}: --{conflicting[0]} is only for fits of numbers; leave it out"])
     parameters = () if settings is not None else make_parameters(initial, free, bounds)
-    if forces is not None:
-        observations = (points, read_forces(forces[0], forces[1], len(initial.probes)))
+    measured = [] if forces is None else [read_forces(*forces, len(initial.probes))]
+    observations: tuple[Observation, ...] = (points, *measured)
     if (correlation := method.get("correlation")) is not None:
         if not 0 < correlation < math.inf:
             raise SceneError([f"--correlation {correlation:g}: take a number of pixels above 0"])
@@ -153,8 +157,8 @@ def _read_problem(
             raise SceneError([f"{points.name}: --correlation is in pixels, and these are positions; leave it out"])
     if (drift := method.get("drift")) is not None and not 0 < drift < math.inf:
         raise SceneError([f"--drift {drift:g}: take a number of seconds above 0"])
-    if settings is None and (problems := list(faults(observations, initial, len(parameters)))):
-        raise SceneError(problems)
+    if settings is None and (messages := list(faults(observations, initial, len(parameters)))):
+        raise SceneError(messages)
     return FitProblem(secrets.token_hex(8), without_outputs(initial), parameters, observations), settings
 
 
@@ -164,34 +168,34 @@ def _fit(runs: Runs, scene: Scene, method: Method) -> FitResult:
     error_correlation = ErrorCorrelation(method.get("correlation"), method.get("drift"))
     start = np.zeros(len(parameters))
     runs.expected = 8 * len(start) + 4
-    first = runs.first(start)
+    initial = runs.predict_initial(start)
     machine = runs.problem if isinstance(runs.problem, MachineProblem) else None
-    problems: list[str] = []
+    messages: list[str] = []
     if machine is None:
-        problems += faults_at_start(observations, scene, first, parameters)
+        messages += faults_at_start(observations, scene, initial, parameters)
     if not any(probe.moved for probe in scene.probes):
-        # The forces of force-controlled tools do not depend on the tissue.
-        problems += unit_faults(observations, first)
-    if problems:
-        raise SceneError(problems)
+        # Without position-controlled tools no tissue changes the forces, so a wrong unit is certain before the search.
+        messages += unit_faults(observations, initial)
+    if messages:
+        raise SceneError(messages)
     signals = [observed.signal(scene) or 1.0 for observed in observations]
     misfit = Misfit(observations, signals, robust=method.get("robust", False))
     if isinstance(runs, CurveRuns):
-        search, solution = search_by_curve(runs, misfit, start, first)
+        search, solution = search_by_curve(runs, misfit, start, initial)
     else:
         search = Search(runs, misfit)
         if machine:
-            search.remember(start, first)
+            search.remember(start, initial)
         solution = search.best(start)
     # A wrong sign or unit contradicts both the initial and the fitted scene.
-    both = first, solution.predicted
-    if problems := [*opposed(observations, scene, *both), *unit_faults(observations, *both)]:
-        raise SceneError(problems)
+    both = initial, solution.predicted
+    if messages := [*opposed(observations, scene, *both), *unit_faults(observations, *both)]:
+        raise SceneError(messages)
     uncertainties = uncertainty(misfit, solution, search.jacobian(solution), error_correlation)
     if isinstance(runs, CurveRuns):
-        runs.by_tangent = False
+        runs.by_tangent = False  # Profiles are those of curves.
     profiles = Profiler(runs, misfit, solution, uncertainties).profiles() if method.get("profile") else None
-    mesh, shifts = _mesh(runs, misfit, solution, uncertainties)
+    mesh_error, shifts = _mesh_effect(runs, misfit, solution, uncertainties)
     estimates = {
         parameter.key: _estimate(parameter, float(solution.x[n]), n, uncertainties, profiles, shifts)
         for n, parameter in enumerate(parameters)
@@ -206,7 +210,7 @@ def _fit(runs: Runs, scene: Scene, method: Method) -> FitResult:
     for observed, part, sigma in zip(observations, residuals, uncertainties.scales, strict=True):
         summaries |= observed.summary(part, sigma)
     has_sigma = all(observed.sigma is not None for observed in observations)
-    notes = [*unit_faults(observations, first), *(note for fitted in tests for note in fitted.loading.test.notes)]
+    notes = [*unit_faults(observations, initial), *(note for fitted in tests for note in fitted.loading.test.notes)]
     notes += _search_notes(solution, parameters, fits_well=search.fits_well(solution))
     notes += _uncertainty_notes(parameters, solution.x, uncertainties, shifts, unidentified)
     notes += unknown_notes(tests, {key: values[key] for key, each in estimates.items() if not each.identifiable})
@@ -226,7 +230,7 @@ def _fit(runs: Runs, scene: Scene, method: Method) -> FitResult:
         degrees_of_freedom=uncertainties.freedom,
         identifiable=all(estimate.identifiable for estimate in estimates.values()),
         unseen=unidentified,
-        mesh_error=mesh,
+        mesh_error=mesh_error,
         runs=runs.count,
         notes=notes,
         scene=Scene(**runs.problem.fitted_data(as_data(scene), values)),
@@ -267,7 +271,7 @@ def _uncertainty_notes(
     """Yield warnings about mesh errors beyond the intervals, and about correlated, but identified parameters."""
     half_widths = uncertainties.quantile * uncertainties.deviations
     if shifts is not None and (moved := np.flatnonzero(shifts > half_widths).tolist()):
-        shares = [(parameters[n].key, parameters[n].share(x[n], float(shifts[n]))) for n in moved]
+        shares = [(parameters[n].key, parameters[n].relative_error(x[n], float(shifts[n]))) for n in moved]
         shifted_parameters = ", ".join(f"{key} by about {rounded(100 * share)} %" for key, share in shares)
         yield f"the mesh changes {shifted_parameters}, more than the interval; take more sheet.points"
     for n, m in zip(*np.nonzero(np.triu(np.abs(uncertainties.correlation) > 0.95, 1)), strict=True):
@@ -298,7 +302,7 @@ def _rejection(
 
 
 def _larger_part(observations: Sequence[Observation], parts: Sequence[Array], predictions: Sequence[Array]) -> str:
-    """Describe the observation with the largest residuals [sigma], and a common factor of its values."""
+    """Name the observation with the largest residuals [sigma], and the ratio to its prediction; "" if all are alike."""
     squares = [float(np.mean(part**2)) for part in parts]
     if len(parts) == 1 or max(squares) < 2.0 * min(squares):
         return ""
@@ -306,13 +310,13 @@ def _larger_part(observations: Sequence[Observation], parts: Sequence[Array], pr
     return f", mostly of the {observations[largest].noun}{observations[largest].factor_note(predictions[largest])}"
 
 
-def _mesh(
+def _mesh_effect(
     runs: Runs, misfit: Misfit, solution: Solution, uncertainties: Uncertainty
 ) -> tuple[float | None, Array | None]:
-    """Return the mesh error, and the resulting shifts of the parameters in units of x, NaN if unknown.
+    """Return the mesh error, and the shift of x that it causes, shape (n,), NaN if unknown; None without coarse meshes.
 
-    Shifts are extrapolated with the order of convergence on three meshes, limited by the expected order. A shift that
-    is small by chance on the finer meshes is replaced by the expectation from the coarser ones.
+    Richardson extrapolation, with the order of convergence of three meshes, at most the expected order. The two finer
+    meshes may agree by chance: a shift is at least the coarser one, reduced by the expected order.
     """
     error = runs.mesh_error(solution.x)
     if error is None or (half_mesh := runs.predict_coarse(solution.x, 1)) is None:
@@ -353,7 +357,7 @@ def _estimate(
         standard_error=parameter.error(x, deviation),
         interval=(interval[0], interval[1]),
         start=parameter.start,
-        identifiable=parameter.share(x, deviation) <= MAX_RELATIVE_ERROR,
+        identifiable=parameter.relative_error(x, deviation) <= MAX_RELATIVE_ERROR,
         mesh_error=None if shifts is None or math.isnan(shifts[index]) else parameter.error(x, float(shifts[index])),
     )
 

@@ -22,7 +22,7 @@ from taichi_msm.machines.cells import Row, decimal_mark, read_text
 from taichi_msm.runs.simulation import Simulation
 from taichi_msm.scene.scene import Scene
 
-# Other units per newton, and largest factor between such a unit and an observed ratio.
+# Units in which forces may be given by mistake, per newton; largest factor between such a ratio and an observed one.
 UNITS_PER_NEWTON, MAX_UNIT_FACTOR = {"mN": 1000.0, "gf": 101.97, "kN": 0.001}, 3.0
 
 # Columns and their units.
@@ -32,7 +32,7 @@ EXPECTED = f"name a forces.csv, with the columns {', '.join(COLUMNS)}"
 
 @dataclass(frozen=True, eq=False)
 class Forces(Observation):
-    """Forces [N] with independent errors, given sigma; values of shape (rows, components), times (rows,)."""
+    """Forces [N] with independent errors of a given sigma; values of shape (rows, components), times (rows,)."""
 
     noun: ClassVar[str] = "forces"
     unit: ClassVar[str] = "N"
@@ -53,7 +53,7 @@ class Forces(Observation):
         return {"residual_force": float(np.sqrt(np.mean(residuals**2))), "sigma_force": float(np.mean(sigma))}
 
     def factor_note(self, predicted: Array) -> str:
-        """Return a clause about a common factor of measured and predicted forces, or an empty string."""
+        """Return a clause with the ratio of measured to predicted forces, or an empty string."""
         square = float(np.nansum(predicted**2 * self.known))
         factor = float(np.nansum(predicted * self.values)) / square if square else 1.0
         return f", which are {factor:.3g} times the predicted ones" if abs(factor - 1) > 0.02 else ""
@@ -69,7 +69,7 @@ class ForceModel(ObservationModel):
     """
 
     def __init__(self, scene: Scene, observed: ToolForces, frames: int) -> None:
-        self._probe, self._shares = observed.probe, observation.time_weights(scene, observed.time, frames)
+        self._probe, self._time_weights = observed.probe, observation.time_weights(scene, observed.time, frames)
 
     def record(self, simulation: Simulation) -> Array:
         """Return the force of every probe in the current frame [N], shape (probes, 3)."""
@@ -77,7 +77,7 @@ class ForceModel(ObservationModel):
 
     def predict(self, recorded: Array) -> Array:
         """Return the forces of all rows [N], shape (rows, 3); `recorded`: shape (frames, probes, 3)."""
-        rows, at_times = len(self._probe), self._shares @ recorded.reshape(len(recorded), -1)
+        rows, at_times = len(self._probe), self._time_weights @ recorded.reshape(len(recorded), -1)
         return np.asarray(at_times.reshape(rows, -1, 3)[np.arange(rows), self._probe])
 
 
@@ -146,10 +146,11 @@ def read_forces(path: str | Path, sigma: float, probes: int) -> ToolForces:
     columns = [names.index(key) for key in COLUMNS]
     _require_units(grid.place(header), [units[column] for column in columns])
     rows = [n for n in range(header + 1, len(grid.rows)) if grid.has_content(n)]
+    # The first row below the header may consist of units.
     first_row = grid.rows[rows[0]] if rows else []
-    units = [first_row[column].strip("[]() ") if column < len(first_row) else "" for column in columns]
-    if units[0].isalpha() and units[0].lower() != "nan":
-        _require_units(grid.place(rows.pop(0)), units)
+    row_units = [first_row[column].strip("[]() ") if column < len(first_row) else "" for column in columns]
+    if row_units[0].isalpha() and row_units[0].lower() != "nan":
+        _require_units(grid.place(rows.pop(0)), row_units)
     for n in rows:
         grid.require_width(n, header)
         if (count := grid.counts[n]) < len(names):
@@ -195,7 +196,7 @@ def _is_header(row: Row) -> bool:
 
 
 def _require_units(where: str, units: Sequence[str]) -> None:
-    """Raise a SceneError unless units are absent, seconds and newtons."""
+    """Raise a SceneError unless every unit is missing, or seconds or newtons as in `COLUMNS`."""
     for (key, expected), unit in zip(COLUMNS.items(), units, strict=True):
         if unit not in (expected, "", "-", "1"):
             raise SceneError([f"{where}: {key}: unit {unit!r}; give seconds and newtons"])

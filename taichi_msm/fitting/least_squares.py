@@ -20,7 +20,7 @@ from taichi_msm.fitting.predict import Prediction, Runs, difference_step
 # Largest residual with almost full weight in robust fits, in sigma.
 OUTLIER_SIGMAS = 2.0
 
-# Largest log of the factor between alternative starts and the first one.
+# Largest coordinate of an alternative start, a factor of 10 from the initial value.
 MAX_START_LOG = np.log(10.0)
 
 # Standard deviations of the values of every observation, in its unit: one number, or an array of shape (known,).
@@ -93,11 +93,11 @@ class Misfit:
         return self.scaled(self.difference(predicted), scales)
 
     def robust_factor(self, residuals: Array) -> Array:
-        """Return d; the derivatives of rho / 2 by r are r d^(-1/2) and d^(-3/2)."""
+        """Return d(r), 1 unless robust; the derivatives of rho / 2 by r are r d^(-1/2) and d^(-3/2)."""
         return 1 + (residuals / OUTLIER_SIGMAS) ** 2 if self.robust else np.ones_like(residuals)
 
     def cost(self, residuals: Array) -> float:
-        """Return half the sum of rho, as SciPy does."""
+        """Return half the sum of rho, the cost of SciPy."""
         rho = 2 * OUTLIER_SIGMAS**2 * (np.sqrt(self.robust_factor(residuals)) - 1) if self.robust else residuals**2
         return float(np.sum(rho)) / 2
 
@@ -164,8 +164,8 @@ class Search:
         misfit = self._misfit
         residuals = misfit.split(misfit.difference(solution.predicted))
         deviations = misfit.deviations(solution.predicted, len(solution.x))
-        each = zip(misfit.observations, residuals, deviations, misfit.signals, strict=True)
-        return all(observed.fits_well(part, deviation, signal) for observed, part, deviation, signal in each)
+        rows = zip(misfit.observations, residuals, deviations, misfit.signals, strict=True)
+        return all(observed.fits_well(part, deviation, signal) for observed, part, deviation, signal in rows)
 
     def jacobian(self, solution: Solution) -> Array:
         """Return the Jacobian of the predictions by x, shape (known, n)."""
@@ -246,22 +246,22 @@ class Search:
             neighbours.append([np.where(unit, side, x) for side in sides])
         self._runs.expected = max(self._runs.expected, self._runs.count + 3 * len(x))
         # Central differences reuse the forward ones of the last Jacobian of the search.
-        each = [neighbour for pair in neighbours for neighbour in pair]
-        missing = [neighbour for neighbour in each if neighbour.tobytes() not in self._neighbours]
+        points = [neighbour for pair in neighbours for neighbour in pair]
+        missing = [point for point in points if point.tobytes() not in self._neighbours]
         computed = zip(missing, self._runs.predict_many(missing, predicted.steps), strict=True)
-        known = self._neighbours | {neighbour.tobytes(): prediction for neighbour, prediction in computed}
-        self._neighbours = {neighbour.tobytes(): known[neighbour.tobytes()] for neighbour in each}
+        known = self._neighbours | {point.tobytes(): prediction for point, prediction in computed}
+        self._neighbours = {point.tobytes(): known[point.tobytes()] for point in points}
         columns = []
         for n, parameter in enumerate(self._runs.problem.parameters):
             pairs = [(neighbour[n], known[neighbour.tobytes()]) for neighbour in neighbours[n]]
-            points = [(side, prediction) for side, prediction in pairs if prediction is not None]
-            if not points and len(signs) == 1:
+            sides = [(side, prediction) for side, prediction in pairs if prediction is not None]
+            if not sides and len(signs) == 1:
                 # A backward difference may succeed.
                 return self._differences(x, predicted, signs=(1, -1))
-            if not points:
+            if not sides:
                 remedy = "give --bounds or another start by --set"
                 raise SceneError([f"{parameter.key}: no run close to its value succeeds; {remedy}"])
-            (x_first, first), (x_second, second) = [*points, (x[n], predicted)][:2]
+            (x_first, first), (x_second, second) = [*sides, (x[n], predicted)][:2]
             columns.append((self._misfit.vector(first) - self._misfit.vector(second)) / (x_first - x_second))
         return np.stack(columns, axis=1)
 

@@ -1,22 +1,23 @@
-"""Fast approximation of quasi-static machine tests: one curve of elastic force over travel, relaxed in time.
+"""Fast fit of quasi-static machine tests by a force curve, the elastic force over the travel of the tool.
 
-As all elastic forces relax alike, the equilibrium of the tissue depends only on the travel of the tool. The elastic
-force f over the travel is computed at a few travels, and interpolated. The force of a test at frame n is
+All elastic forces relax alike, so the equilibrium of the tissue depends only on the travel. One run gives the elastic
+force f at `TRAVELS` travels, and interpolation between them the force of any test at frame n,
 
-    F_n = (1 - G) f_n + sum of (s_i + share_i phi_i f_n)
+    F_n = (1 - G) f_n + sum over i of (s_i + share_i phi_i f_n)
 
-with shares, phi and memory s_i as in `terms/viscoelasticity.py`. Depths of contact, shares and times need no further
-curve. In the other parameters, log f is linearised: in their logarithms, and in the reciprocal of a lock, with one more
-curve per parameter. This tangent is minimised within a trust region, and a curve is computed at its minimum, until the
-cost does not improve.
+with G, share_i, phi_i and memory s_i as in `terms/viscoelasticity.py`.
 
-Curves neglect the memory of mass points that leave the tool or slide along it. Therefore the tests are finally run, and
-their difference from the tangent is added to it. The Jacobian is that of the tangent.
+- Depths of contact, shares and times change F_n, but not the curve.
+- Other parameters change the curve. Its tangent is linear: log f over the log of each parameter, or over the reciprocal
+  of a lock, from one more curve per parameter. The search minimises the cost of the tangent within a trust region,
+  computes the curve at the minimum, and repeats both until the cost stops falling.
+- A curve neglects the memory of mass points that leave the tool or slide along it. The last steps of the search
+  therefore run the tests, and add the error of the tangent to it. The Jacobian is that of the tangent.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from contextlib import suppress
 from dataclasses import replace
 from typing import NamedTuple
@@ -24,7 +25,7 @@ from typing import NamedTuple
 import numpy as np
 
 from taichi_msm.errors import DivergedError, SceneError, StageProgressCallback
-from taichi_msm.fitting.least_squares import Misfit, Search, Solution
+from taichi_msm.fitting.least_squares import Misfit, Scales, Search, Solution
 from taichi_msm.fitting.machine_model import MachineModel, MachineProblem
 from taichi_msm.fitting.observation import Array
 from taichi_msm.fitting.predict import FitProblem, Prediction, Runs, difference_step, mesh_error
@@ -32,10 +33,10 @@ from taichi_msm.load.check import check_scene
 from taichi_msm.model.plan import Plan
 from taichi_msm.scene.scene import Scene
 
-# Number of travels of a curve above 0, and margin beyond the greatest travel if depths of contact are free, as a share.
+# Number of travels of a curve above 0; extension of the curve for free depths of contact [share of its reach].
 TRAVELS, CONTACT_MARGIN = 24, 0.05
 
-# Share of every branch in the run of a curve: the tissue does not relax, but the compiled kernels are those of tests.
+# Share of every branch in the run of a curve: no relaxation, but the compiled kernels of the tests.
 NO_SHARE = 1e-12
 
 # Largest sum of the shares in a prediction.
@@ -43,17 +44,17 @@ MAX_SHARES = 0.999
 
 
 def has_curve(problem: object) -> bool:
-    """Return whether a fit is of quasi-static machine tests, with a single tool that does not grip."""
+    """Return whether a force curve applies: quasi-static machine tests, with a single tool that does not grip."""
     if not isinstance(problem, MachineProblem):
         return False
     return problem.scene.time.at_rest and len(problem.scene.probes) == 1 and not problem.scene.probes[0].grip
 
 
 def relax(elastic: Array, branches: Sequence[tuple[float, float]], h: float) -> Array:
-    """Return the force of relaxing tissue [N], shape (frames,).
+    """Return the forces F_n of relaxing tissue [N], shape (frames,).
 
     Args:
-        elastic: elastic force at every frame [N], shape (frames,).
+        elastic: elastic forces f_n [N], shape (frames,).
         branches: share and time [s] of every branch.
         h: time between frames [s].
     """
@@ -79,7 +80,7 @@ class _Tangent(NamedTuple):
 
 
 class CurveRuns(Runs):
-    """Predictions of machine tests by curves, or by their tangent, with a correction at every frame.
+    """Predictions of machine tests by curves or by a tangent, both plus one correction of every frame.
 
     Args:
         problem: the fit.
@@ -87,13 +88,12 @@ class CurveRuns(Runs):
         progress: progress callback, as for `Runs`.
 
     Attributes:
-        by_tangent: whether to predict by the tangent, or by curves.
-        is_of_curve: mask of the parameters that a curve depends on, shape (n,).
-        is_contact: mask of the depths of contact, shape (n,).
+        by_tangent: whether `predict_one` uses the tangent; otherwise it computes a curve.
+        changes_curve: mask of the parameters that change the curve, shape (n,).
     """
 
     problem: MachineProblem
-    _predictor: MachineModel
+    _model: MachineModel
     _tangent: _Tangent
 
     def __init__(self, problem: FitProblem, workers: int | None, progress: StageProgressCallback) -> None:
@@ -102,12 +102,12 @@ class CurveRuns(Runs):
         self._correction: Array | float = 0.0
         self.by_tangent = True
         keys = [parameter.key for parameter in self.problem.parameters]
-        self.is_of_curve = np.array([not key.startswith(("contact", "tissue.relaxation.")) for key in keys])
-        self.is_contact = np.array([key.startswith("contact") for key in keys])
+        self.changes_curve = np.array([not key.startswith(("contact", "tissue.relaxation.")) for key in keys])
+        self._is_contact = np.array([key.startswith("contact") for key in keys])
         self._is_lock = np.array([key.endswith(".lock") for key in keys])
 
-    def first(self, x: Array) -> Prediction:
-        self._predictor.compile(x, self._report_progress)
+    def predict_initial(self, x: Array) -> Prediction:
+        self._model.compile(x, self._report_progress)
         return self.run_curve(x)
 
     def predict_one(self, x: Array, steps: int | None = None) -> Prediction | None:
@@ -115,7 +115,7 @@ class CurveRuns(Runs):
             return self.predict_coarse(x, 0)
         tangent = self._tangent
         try:
-            values = self._predictor.values(x)
+            values = self._model.values(x)
         except SceneError:
             return None
         distance = x - tangent.x
@@ -129,8 +129,8 @@ class CurveRuns(Runs):
             return None
 
     def mesh_error(self, x: Array) -> float | None:
-        # The run of a curve stands for those of the tests.
-        values = self._predictor.values(x)
+        # The run of the curve has the mesh error of the tests.
+        values = self._model.values(x)
         return mesh_error(self._plan_curve(values, self._reach(values)), self._report_progress)
 
     def run_curve(self, x: Array, halvings: int = 0) -> Prediction:
@@ -140,28 +140,28 @@ class CurveRuns(Runs):
             x: coordinates of the parameters, shape (n,).
             halvings: number of halvings of the cells per side.
         """
-        values = self._predictor.values(x)
+        values = self._model.values(x)
         reach = self._reach(values)
         return self._predict(values, reach, self._forces(values, reach, halvings))
 
     def run_tests(self, x: Array) -> Prediction:
         """Return the prediction by runs of the tests at x; raise the errors of `ForwardModel.predict`."""
         self.count += len(self.problem.tests)
-        return self._predictor.predict(x, pause=self._report_progress)
+        return self._model.predict(x, pause=self._report_progress)
 
     def correct(self, x: Array, predicted: Prediction) -> None:
-        """Correct all further predictions by the error of the tangent at x.
+        """Add the error of the tangent at x to all further predictions.
 
         Args:
             x: coordinates of the parameters, shape (n,).
-            predicted: exact prediction at x.
+            predicted: prediction at x by a curve, or by runs of the tests.
         """
         if (by_tangent := self.predict_one(x)) is not None:
             self._correction = self._correction + predicted.values[0] - by_tangent.values[0]
 
     def with_valid_shares(self, x: Array) -> Array:
         """Return x, with the free shares scaled down if all shares sum to more than `MAX_SHARES`."""
-        values = self._predictor.values(x)
+        values = self._model.values(x)
         branches = self._branches(values)
         free = [key for n in range(len(branches)) if (key := f"tissue.relaxation.{n}.share") in values]
         total = sum(share for share, _ in branches)
@@ -174,39 +174,48 @@ class CurveRuns(Runs):
 
     def set_tangent(self, x: Array) -> None:
         """Linearise the curve at x; raise the errors of `ForwardModel.predict`."""
-        values = self._predictor.values(x)
+        values = self._model.values(x)
         reach = self._reach(values)
         forces, slopes = self._forces(values, reach), np.zeros((len(x), TRAVELS + 1))
-        for n in np.flatnonzero(self.is_of_curve):
+        for n in np.flatnonzero(self.changes_curve):
             shifted, delta = x.copy(), difference_step(self.problem.scene)
             delta = delta if x[n] + delta <= self.problem.parameters[n].limits[1] else -delta
             shifted[n] += delta
-            moved = self._forces(self._predictor.values(shifted), reach)
+            moved = self._forces(self._model.values(shifted), reach)
             is_pressed = (forces > 0) & (moved > 0)
             slopes[n] = np.log(np.where(is_pressed, moved, 1.0) / np.where(is_pressed, forces, 1.0)) / delta
         self._tangent = _Tangent(x, reach, forces, slopes)
 
-    @property
-    def reach(self) -> float:
-        """Greatest travel of the tangent's curve [m]."""
-        return self._tangent.reach
+    def trust_region(self, x: Array, region: Array) -> tuple[Array, Array]:
+        """Return the smallest and largest coordinates within bounds and within the reach of the curve, shape (n,) each.
+
+        Args:
+            x: centre, shape (n,).
+            region: half width in every coordinate, shape (n,).
+        """
+        low, high = self.problem.limits
+        margin = np.array(
+            [CONTACT_MARGIN * self._tangent.reach / (parameter.scale or 1) for parameter in self.problem.parameters]
+        )
+        below = np.where(self._is_contact, np.minimum(region, margin), region)
+        return np.maximum(low, x - below), np.minimum(high, x + region)
 
     def _reach(self, values: dict[str, float]) -> float:
         """Return the greatest travel of a curve [m]; raise a SceneError if it is 0 in all tests."""
         if not (reach := self.problem.reach(values)):
             raise SceneError(["contact: no test is deeper; take a smaller depth"])
-        return reach * (1 + CONTACT_MARGIN * self.is_contact.any())
+        return reach * (1 + CONTACT_MARGIN * self._is_contact.any())
 
     def _branches(self, values: dict[str, float]) -> list[tuple[float, float]]:
         """Return share and time [s] of every branch of relaxation."""
         branches = []
-        for n, branch in enumerate(self._predictor.data.get("tissue", {}).get("relaxation", ())):
+        for n, branch in enumerate(self._model.data.get("tissue", {}).get("relaxation", ())):
             key = f"tissue.relaxation.{n}"
             branches.append((values.get(f"{key}.share", branch["share"]), values.get(f"{key}.time", branch["time"])))
         return branches
 
     def _predict(self, values: dict[str, float], reach: float, forces: Array) -> Prediction:
-        """Predict the tests by a curve."""
+        """Predict the tests by a curve of `forces`, at equidistant travels up to `reach` [m]."""
         from scipy.interpolate import PchipInterpolator
 
         curve = PchipInterpolator(np.linspace(0, reach, TRAVELS + 1), forces)
@@ -222,54 +231,51 @@ class CurveRuns(Runs):
 
     def _forces(self, values: dict[str, float], reach: float, halvings: int = 0) -> Array:
         """Return the forces of a curve at equidistant travels [N], shape (TRAVELS + 1,), with a cache."""
-        curve_values = [value for value, matters in zip(values.values(), self.is_of_curve, strict=True) if matters]
+        curve_values = [value for value, changes in zip(values.values(), self.changes_curve, strict=True) if changes]
         key = (halvings, reach, *curve_values)
         if key not in self._curves:
             self._report_progress()
-            simulation, plan = self._predictor.start(self._plan_curve(values, reach), None, halvings)
-            self._curves[key] = self._predictor.forces(simulation, plan, self._report_progress)[:, 0]
+            simulation, plan = self._model.start(self._plan_curve(values, reach), None, halvings)
+            self._curves[key] = self._model.forces(simulation, plan, self._report_progress)[:, 0]
             self.count += 1
         return self._curves[key]
 
     def _plan_curve(self, values: dict[str, float], reach: float) -> Plan:
         """Plan a run with equidistant travels up to `reach` [m], without relaxation."""
-        data = self.problem.with_scene_values(self._predictor.data, values)
+        data = self.problem.with_scene_values(self._model.data, values)
         if branches := data.get("tissue", {}).get("relaxation"):
             still_branches = [{**branch, "share": NO_SHARE} for branch in branches]
             data = {**data, "tissue": {**data["tissue"], "relaxation": still_branches}}
         placed = self.problem.approach.place(data, np.linspace(0, reach, TRAVELS + 1), 1.0)
-        return check_scene(Scene(**placed), self._predictor.maps)
+        return check_scene(Scene(**placed), self._model.maps)
 
 
-def search_by_curve(runs: CurveRuns, misfit: Misfit, start: Array, first: Prediction) -> tuple[Search, Solution]:
+def search_by_curve(runs: CurveRuns, misfit: Misfit, start: Array, initial: Prediction) -> tuple[Search, Solution]:
     """Minimise the misfit by tangents, then by curves, then by runs of the tests.
 
     Args:
         runs: predictions.
         misfit: residuals.
         start: initial coordinates of the parameters, shape (n,).
-        first: prediction at `start`.
+        initial: prediction at `start`.
 
     Returns:
-        Search by the last tangent, and solution with the forces of the test runs.
+        The search, whose Jacobian is that of the last tangent, and the solution, with the forces of runs of the tests.
 
     Raises:
         SceneError: when the scene is invalid in the neighbourhood of the solution.
         DivergedError: when the run of a curve diverges.
     """
     search = Search(runs, misfit)
-    solution = _descend(runs, misfit, _scale_stiffnesses(runs, misfit, start, first), by_tests=False)
+    solution = _descend(runs, misfit, _scale_stiffnesses(runs, misfit, start, initial), by_tests=False)
     starts = []
     if not search.fits_well(solution):
-        costs = []
-        for x in search.alternative_starts():
-            if (predicted := runs.predict_coarse(x, 0)) is not None:
-                costs.append((misfit.cost(misfit.residuals(predicted, solution.scales)), x.tolist()))
-        starts = [np.array(x) for _, x in sorted(costs)[:2]]
-    # A lock or factor beyond the measured range has no effect there, with less than 3 sigma per unit of x, but may fit
-    # better at a smaller value.
-    information = np.linalg.norm(misfit.scaled(search.jacobian(solution), solution.scales), axis=0)
-    for n in np.flatnonzero(runs.is_of_curve & (information < 3.0)):
+        predictions = ((x, runs.predict_coarse(x, 0)) for x in search.alternative_starts())
+        starts = _two_best(predictions, misfit, solution.scales)
+    # A parameter with an effect below 3 sigma per unit of x, such as a lock beyond the measured range, may fit better
+    # at a smaller value.
+    effect = np.linalg.norm(misfit.scaled(search.jacobian(solution), solution.scales), axis=0)
+    for n in np.flatnonzero(runs.changes_curve & (effect < 3.0)):
         starts.append(solution.x.copy())
         starts[-1][n] = max(start[n] - 1, runs.problem.parameters[n].limits[0])
     for x in starts:
@@ -299,32 +305,31 @@ def _descend(runs: CurveRuns, misfit: Misfit, start: Array, *, by_tests: bool) -
         predicted = runs.run_tests(x) if by_tests else runs.run_curve(x)
         return Solution(x, predicted, scales, misfit.cost(misfit.residuals(predicted, scales)), converged=False)
 
-    def is_at_end(cost: float, current: float) -> bool:
+    def is_converged(cost: float, previous: float) -> bool:
         # A third of a standard deviation of a parameter changes the cost by 0.05.
-        return abs(current - cost) <= max(1e-3 * current, 0.05)
+        return abs(previous - cost) <= max(1e-3 * previous, 0.05)
 
     current = evaluate(start)
     # The trust region of curve parameters starts at 0.5, and grows to 2 at most, in units of x.
-    trial, region = current, np.where(runs.is_of_curve, 0.5, np.inf)
+    trial, region = current, np.where(runs.changes_curve, 0.5, np.inf)
     for step in range(20):
-        if step and is_at_end(trial.cost, current.cost):
+        if step and is_converged(trial.cost, current.cost):
             return replace(min(trial, current, key=lambda each: each.cost), converged=True)
         if trial.cost <= current.cost:
             if not by_tests:
                 runs.set_tangent(trial.x)
             runs.correct(trial.x, trial.predicted)
-            current, region = trial, np.minimum(2 * region, np.where(runs.is_of_curve, 2.0, np.inf))
+            current, region = trial, np.minimum(2 * region, np.where(runs.changes_curve, 2.0, np.inf))
         else:
             shrunk = np.minimum(region, np.abs(trial.x - current.x)) / 4
-            region = (
-                shrunk
-                if by_tests
-                else np.where(runs.is_of_curve, shrunk.max(where=runs.is_of_curve, initial=0), region)
-            )
-        limits = _limits(runs, current.x, region)
+            # Curves limit the parameters that change the curve, all alike; runs of the tests limit each by itself.
+            if not by_tests:
+                shrunk = np.where(runs.changes_curve, shrunk.max(where=runs.changes_curve, initial=0), region)
+            region = shrunk
+        limits = runs.trust_region(current.x, region)
         starts = [current.x] if by_tests or step else [current.x, *_relaxation_starts(runs, misfit, current, limits)]
         minimum = min((Search(runs, misfit, limits).refine(x) for x in starts), key=lambda each: each.cost)
-        if is_at_end(minimum.cost, current.cost):
+        if is_converged(minimum.cost, current.cost):
             return replace(current, converged=True)
         try:
             trial = evaluate(runs.with_valid_shares(minimum.x))
@@ -333,27 +338,25 @@ def _descend(runs: CurveRuns, misfit: Misfit, start: Array, *, by_tests: bool) -
     return current
 
 
-def _limits(runs: CurveRuns, x: Array, region: Array) -> tuple[Array, Array]:
-    """Return the bounds of x, which keep depths of contact within the reach of the curve."""
-    low, high = runs.problem.limits
-    margin = np.array([CONTACT_MARGIN * runs.reach / (parameter.scale or 1) for parameter in runs.problem.parameters])
-    below = np.where(runs.is_contact, np.minimum(region, margin), region)
-    return np.maximum(low, x - below), np.minimum(high, x + region)
-
-
 def _relaxation_starts(runs: CurveRuns, misfit: Misfit, current: Solution, limits: tuple[Array, Array]) -> list[Array]:
-    """Return the two best of 64 starts that vary the parameters without a curve by a factor of at most 10."""
-    free = np.flatnonzero(~runs.is_of_curve)
+    """Return the two best of 64 starts, within a factor of 10 in the parameters that do not change the curve."""
+    free = np.flatnonzero(~runs.changes_curve)
     if not len(free):
         return []
     from scipy.stats import qmc
 
     max_log = np.log(10.0)
     low, high = (np.clip(limit[free], current.x[free] - max_log, current.x[free] + max_log) for limit in limits)
-    costs = []
-    for shares in qmc.Sobol(len(free), seed=1).random(64):
-        x = current.x.copy()
-        x[free] = low + shares * (high - low)
-        if (predicted := runs.predict_one(x)) is not None:
-            costs.append((misfit.cost(misfit.residuals(predicted, current.scales)), x.tolist()))
+    starts = np.tile(current.x, (64, 1))
+    starts[:, free] = low + qmc.Sobol(len(free), seed=1).random(64) * (high - low)
+    return _two_best(((x, runs.predict_one(x)) for x in starts), misfit, current.scales)
+
+
+def _two_best(predictions: Iterable[tuple[Array, Prediction | None]], misfit: Misfit, scales: Scales) -> list[Array]:
+    """Return the two coordinates of lowest cost; None is the prediction of a failed run."""
+    costs = [
+        (misfit.cost(misfit.residuals(predicted, scales)), x.tolist())
+        for x, predicted in predictions
+        if predicted is not None
+    ]
     return [np.array(x) for _, x in sorted(costs)[:2]]

@@ -33,7 +33,7 @@ class FittedTest:
 
     @property
     def residual(self) -> float:
-        """Root mean squares_by_shift of the residual over the frames [N]."""
+        """Root mean square of the residual over the frames [N]."""
         return float(np.sqrt(np.mean((self.force - self.loading.force) ** 2)))
 
     @property
@@ -143,11 +143,11 @@ def _explain(fitted: FittedTest, *, fits_contact: bool) -> str:
 
 
 def _explain_by_another_contact(fitted: FittedTest, rising: slice) -> str:
-    """Return whether another depth of contact explains the residual, as a sentence or an empty string.
+    """Return a sentence about another depth of contact that explains the residual, or an empty string.
 
-    The fitted stiffness depends on the assumed contact. Therefore the measured forces of the frames `rising`, up to the
-    peak, are fitted by the model's forces, shifted in depth and scaled; a later contact adds a constant, the friction
-    or weight of a slack. The same model without shift, but with a factor linear in depth, must fit worse.
+    The fitted forces, shifted in depth and scaled, are compared with the measured ones at the frames `rising`, up to
+    the peak; the scale is free, as the fitted stiffness depends on the contact. A later contact adds a constant: the
+    friction or weight of a slack. The shift must fit better than a scale that is linear in depth.
     """
     loading = fitted.loading
     travel, place = loading.travel(fitted.contact)[rising], loading.depth[rising] - fitted.contact
@@ -163,10 +163,10 @@ def _explain_by_another_contact(fitted: FittedTest, rising: slice) -> str:
     shift = 0.0
     for shifts in (np.linspace(-0.5, 0.9, 141), np.linspace(-0.01, 0.01, 41)):
         shift = min((shift + reach * shifts).tolist(), key=lambda shift: fit_shifted(shift)[0])
-    squares_by_shift, coefficients = fit_shifted(shift)
-    squares_by_curvature, _ = _fit_linear(measured, model, model * travel, is_pressed)
-    explained = 1 - squares_by_shift / max(float((model - measured) @ (model - measured)), 1e-300)
-    if abs(shift) <= 0.02 * reach or explained <= 0.7 or squares_by_shift >= squares_by_curvature:
+    shifted_misfit, coefficients = fit_shifted(shift)
+    linear_misfit, _ = _fit_linear(measured, model, model * travel, is_pressed)
+    explained = 1 - shifted_misfit / max(float((model - measured) @ (model - measured)), 1e-300)
+    if abs(shift) <= 0.02 * reach or explained <= 0.7 or shifted_misfit >= linear_misfit:
         return ""
     slack = ""
     if shift > 0 and coefficients[1] > CONTACT_NOISES * loading.noise:

@@ -86,7 +86,7 @@ class MachineProblem(FitProblem):
         return self.approach.place(data, test.travel(contact), test.rate)
 
     def with_scene_values(self, data: dict[str, Any], values: Mapping[str, float]) -> dict[str, Any]:
-        """Return a scene's data with parameter values, and its own path and times.
+        """Return a scene's data with parameter values, and with unchanged path and times.
 
         Args:
             data: data of a scene, from `as_data`.
@@ -111,14 +111,14 @@ class MachineModel(ForwardModel):
         x: Array,
         steps: int | None = None,
         *,
-        coarse: int = 0,
+        halvings: int = 0,
         to_end: bool = False,  # Ignored: every run ends with its test.
         pause: Pause = lambda: None,
     ) -> Prediction:
         forces, most_steps = [], 0
         for n in range(len(self.problem.tests)):
             data = self.problem.fitted_data(self.data, self.values(x), n)
-            simulation, plan = self.start(check_scene(Scene(**data), self.maps), steps, coarse)
+            simulation, plan = self.start(check_scene(Scene(**data), self.maps), steps, halvings)
             forces.append(self.forces(simulation, plan, pause))
             most_steps = max(most_steps, plan.grid.steps_per_frame)
         return Prediction((np.concatenate(forces),), most_steps, np.zeros(1))
@@ -155,8 +155,8 @@ def table_paths(observed: Any) -> list[str]:
     if len(others) == len(paths) == 1:
         return []
     if others or not paths:
-        fault = "only tables of a testing machine can be several"
-        raise SceneError([f"{others[0] if others else 'observed'}: {fault}, {', '.join(TABLE_SUFFIXES)}"])
+        fault = f"not a table of a testing machine, {', '.join(TABLE_SUFFIXES)}; give tables only, or one other file"
+        raise SceneError([f"{others[0] if others else 'observed'}: {fault}"])
     return [str(path) for path in paths]
 
 
@@ -206,7 +206,7 @@ def read_machine_problem(
     placed = approach.place(as_data(without_outputs(scene)), first.travel(), first.rate)
     observations = MachineForces(
         ", ".join(loading.test.name for loading in tests),
-        np.concatenate([loading.scene_time for loading in tests]),
+        np.concatenate([np.arange(len(loading.force)) / loading.rate for loading in tests]),
         np.concatenate([loading.force for loading in tests])[:, None],
         np.repeat([loading.sigma for loading in tests], lengths),
         approach,
@@ -230,14 +230,15 @@ def _make_parameters(
     of_scene = [key for key in free if key not in contacts]
     parameters = {}
     if of_scene or not free:
-        limits = {key: ends for key, ends in bounds.items() if key not in free or key not in contacts}
+        # Bounds of keys that are not free are an error of `make_parameters`.
+        limits = {key: ends for key, ends in bounds.items() if key not in {*free} & {*contacts}}
         parameters = {parameter.key: parameter for parameter in make_parameters(scene, of_scene, limits)}
     for key, test in zip(contacts, tests, strict=True):
         if key in free:
             # Depths of contact are in metres, as in the table; x is in units of their range.
-            low, high = first, last = float(test.depth[0]), float(test.depth.max())
-            if key in bounds:
-                low, high = max(first, bounds[key][0]), min(last, bounds[key][1])
+            first, last = float(test.depth[0]), float(test.depth.max())
+            low, high = bounds.get(key, (first, last))
+            low, high = max(first, low), min(last, high)
             if not (low <= test.contact <= high and low < high):
                 fault = f"the initial depth is {test.contact:.4g} m, and the greatest one of the table {last:.4g} m"
                 remedy = "take bounds around the initial depth, or another one by --contact"

@@ -21,15 +21,15 @@ Array = NDArray[np.float64]
 # Largest residual of a good fit, as a share of the signal and in sigma.
 MAX_RESIDUAL_SHARE, MAX_RESIDUAL_SIGMAS = 0.1, 2.0
 
-# Opposed components: largest cosine, smallest norm [sigma], and smallest number of values.
+# An opposed component has at most this cosine with its prediction, and at least this norm [sigma] and number of values.
 MAX_COSINE, MIN_SIGMAS, MIN_COUNT = -0.9, 5.0, 3
 
 
 class ErrorCorrelation(NamedTuple):
-    """Correlation lengths of tracking errors; None for independent errors."""
+    """Correlation of tracking errors in space and time; None for independent errors."""
 
-    correlation: float | None  # length between tracks [px]
-    drift: float | None  # time within a track [s]
+    length: float | None  # correlation length of neighbouring tracks [px]
+    drift: float | None  # correlation time of a track [s]
 
 
 class ObservationModel(ABC):
@@ -99,7 +99,7 @@ class Observation(ABC):
 
     @abstractmethod
     def signal(self, scene: Scene) -> float:
-        """Return the root mean square of the values' motion or force, which the model explains [unit]."""
+        """Return the root mean square of the motion or of the forces, the size of what a model explains [unit]."""
 
     @abstractmethod
     def fits_well(self, residuals: Array, deviation: float, signal: float) -> bool:
@@ -113,7 +113,7 @@ class Observation(ABC):
 
     @abstractmethod
     def summary(self, residuals: Array, sigma: float | Array) -> dict[str, Any]:
-        """Return the fields of a `FitResult` with residual and sigma.
+        """Return residual and sigma as fields of a `FitResult`, by name.
 
         Args:
             residuals: predicted minus observed known values [unit], shape (known,).
@@ -134,7 +134,7 @@ class Observation(ABC):
         Args:
             scene: the initial scene.
             predicted: values predicted by the initial scene, with the shape of `values`.
-            same_camera: whether the camera is fixed, so that a displacement is a fault.
+            same_camera: whether the camera is no parameter, so that displaced points are a fault.
         """
         yield from ()
 
@@ -157,12 +157,12 @@ class Observation(ABC):
         Args:
             residuals: predicted minus observed values, with the shape of `values`.
             signal: root mean square from `signal` [unit].
-            correlation: given correlation lengths of the errors.
+            correlation: given correlation of the errors.
         """
         return None
 
     def factor_note(self, predicted: Array) -> str:
-        """Return a clause about a common factor of values and prediction, or an empty string."""
+        """Return a clause with the ratio of measured to predicted values, or an empty string."""
         return ""
 
     def correlated(self, rows: Array, correlation: ErrorCorrelation) -> tuple[Array, float]:
@@ -170,7 +170,7 @@ class Observation(ABC):
 
         Args:
             rows: R, shape (known, n).
-            correlation: correlation lengths that define K.
+            correlation: correlation of the errors, which defines K.
         """
         return rows.T @ rows, float(len(rows))
 
@@ -180,7 +180,7 @@ class Observation(ABC):
         Args:
             predicted: values predicted by the solution, with the shape of `values`.
             signal: root mean square from `signal` [unit].
-            correlation: given correlation lengths of the errors.
+            correlation: given correlation of the errors.
         """
         yield from ()
 
@@ -212,7 +212,7 @@ def time_weights(scene: Scene, time: Array, frames: int) -> Any:
 
 
 def opposed_axes(observed: Array, predictions: Sequence[Array], sigma: Any) -> list[int]:
-    """Return the components (indices of the last axis) that are significant, with the opposite sign in all predictions.
+    """Return the indices of the components that are significant, and opposite to all predictions.
 
     Args:
         observed: observed values, shape (..., components), NaN where not observed.

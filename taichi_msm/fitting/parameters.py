@@ -92,8 +92,8 @@ class Parameter:
         """
         return deviation * (abs(self.value(x)) if self.is_log else self.scale)
 
-    def share(self, x: float, deviation: float) -> float:
-        """Return the standard deviation as a share of the value, or of the range for a coordinate or time.
+    def relative_error(self, x: float, deviation: float) -> float:
+        """Return the standard deviation as a share of the value, of a coordinate or time as a share of its range.
 
         Args:
             x: coordinate.
@@ -208,8 +208,9 @@ def _default_range(scene: Scene, path: Key) -> float:
     if "load" in path:
         return 100.0 if last == 1 else time
     if "path" in path:
+        # A keyframe is [t, across, down, height].
         return (time, 1.0, 1.0, 0.1 * max(scene.sheet.size))[int(last)]
-    # `at` may contain keyframes, with a time before the position.
+    # `at` is a position, or a list of keyframes [t, across, down].
     return time if len(path) == 5 and last == 0 else 1.0
 
 

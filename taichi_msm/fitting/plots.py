@@ -87,27 +87,24 @@ def observation_panels(observed: Observation, fitted: Array, result: FitResult) 
         return [partial(panel, observed=observed, fitted=fitted) for panel in panels]
     if isinstance(observed, ToolForces):
         return [partial(_plot_forces, observed=observed, fitted=fitted)]
-    # The file is in the title of the figure if there is one test only.
+    # The file of a single test is in the title of the figure.
     titles = [printable(Path(test.loading.test.name).name) for test in result.tests]
-    titles = ["Force over time"] if len(titles) == 1 else titles
-    return [
-        panel
-        for test, title in zip(result.tests, titles, strict=True)
-        for panel in (
-            partial(_plot_test_over_time, fitted=test, title=title),
-            partial(_plot_test_over_depth, fitted=test),
-            partial(_plot_test_residual, fitted=test),
-        )
-    ]
+    test_panels: list[Panel] = []
+    for test, title in zip(result.tests, titles if len(titles) != 1 else ["Force over time"], strict=True):
+        test_panels.append(partial(_plot_test_over_time, fitted=test, title=title))
+        test_panels.append(partial(_plot_test_over_depth, fitted=test))
+        test_panels.append(partial(_plot_test_residual, fitted=test))
+    return test_panels
 
 
-def _unit(observed: PointObservation) -> tuple[float, str]:
+def _plotted_unit(observed: PointObservation) -> tuple[float, str]:
+    """Return the factor from the unit of the values to the plotted one, and its name."""
     return (1000.0, "mm") if observed.unit == "m" else (1.0, "px")
 
 
 def _plot_motion(axes: Axes, observed: PointObservation, fitted: Array) -> None:
     """Plot the three points of largest motion over time, along their principal direction."""
-    scale, unit = _unit(observed)
+    scale, unit = _plotted_unit(observed)
     order, centre = np.argsort(observed.time), np.nanmean(fitted, axis=1, keepdims=True)
     motion = np.nan_to_num(fitted - centre)
     for n in np.argsort(-np.linalg.norm(motion, axis=(1, 2)))[:3]:
@@ -120,7 +117,7 @@ def _plot_motion(axes: Axes, observed: PointObservation, fitted: Array) -> None:
 
 
 def _plot_over_time(axes: Axes, time: Array, fitted: Array, observed: Array) -> None:
-    """Plot a fitted line and observed dots; the first ones have labels."""
+    """Plot a fitted line and observed dots, with labels for the first line of the panel."""
     labels = (None, None) if axes.lines else ("fitted", "observed")
     axes.plot(time, fitted, color=BLUE, label=labels[0])
     axes.plot(time, observed, ".", color=VERMILION, markersize=3, label=labels[1])
@@ -128,20 +125,20 @@ def _plot_over_time(axes: Axes, time: Array, fitted: Array, observed: Array) -> 
 
 def _plot_match(axes: Axes, observed: PointObservation, fitted: Array) -> None:
     """Plot observed against fitted values, both relative to the mean fitted position."""
-    scale, unit = _unit(observed)
+    scale, unit = _plotted_unit(observed)
     centre = np.nanmean(fitted, axis=1, keepdims=True)
     x, y = (scale * (values - centre)[observed.known] for values in (fitted, observed.values))
-    subset = slice(None, None, math.ceil(len(x) / 20000) or 1)
+    # At most 20000 dots are drawn.
+    subset = slice(None, None, math.ceil(len(x) / 20000))
     axes.scatter(x[subset], y[subset], 2, color=BLUE, alpha=0.4, linewidths=0)
-    if len(x):
-        ends = [float(x.min()), float(x.max())]
-        axes.plot(ends, ends, color=GREY, linewidth=0.8)
+    ends = [float(x.min()), float(x.max())]
+    axes.plot(ends, ends, color=GREY, linewidth=0.8)
     axes.set(title="Observed against fitted", xlabel=f"fitted, from the mean [{unit}]", ylabel=f"observed [{unit}]")
 
 
 def _plot_residuals(axes: Axes, observed: PointObservation, fitted: Array, sheet: Sheet) -> None:
     """Plot the residual of every point on the sheet."""
-    scale, unit = _unit(observed)
+    scale, unit = _plotted_unit(observed)
     residuals = scale * np.sqrt(np.nanmean((fitted - observed.values) ** 2, axis=(1, 2)))
     across, down = observed.coordinates.T
     dots = axes.scatter(across, down, 14, c=residuals, cmap="viridis", vmin=0)
@@ -215,23 +212,31 @@ def _plot_parameter(axes: Axes, result: FitResult, key: str) -> None:
 def _map_panels(fitted_map: FittedMap, sheet: Sheet) -> list[Panel]:
     """Return the panels of a map: the map, its errors, and the weight of its smoothness."""
     low, high = fitted_map.range
+    # The colours span a factor of at least 1.05.
     ratio, centre = np.sqrt(max(high / low, 1.05)), np.sqrt(low * high)
-    norm, label = LogNorm(centre / ratio, centre * ratio), "factor of young"
-    errors = 100 * fitted_map.errors
+    norm, errors = LogNorm(centre / ratio, centre * ratio), 100 * fitted_map.errors
     error_norm = Normalize(0, float(np.nanmax(errors)) if not fitted_map.unknown.all() else 100.0)
     plot_cells = partial(_plot_cells, unknown=fitted_map.unknown, sheet=sheet)
     return [
-        partial(plot_cells, values=fitted_map.factors, norm=norm, texts=("Stiffness", label, "viridis")),
-        partial(plot_cells, values=errors, norm=error_norm, texts=("Standard error", "error [%]", "cividis")),
+        partial(plot_cells, values=fitted_map.factors, norm=norm, title="Stiffness", label="factor of young"),
+        partial(
+            plot_cells, values=errors, norm=error_norm, title="Standard error", label="error [%]", colours="cividis"
+        ),
         partial(_plot_weight, choice=fitted_map.choice),
     ]
 
 
 def _plot_cells(
-    axes: Axes, values: Array, unknown: NDArray[np.bool_], sheet: Sheet, norm: Normalize, texts: tuple[str, str, str]
+    axes: Axes,
+    values: Array,
+    unknown: NDArray[np.bool_],
+    sheet: Sheet,
+    norm: Normalize,
+    title: str,
+    label: str,
+    colours: str = "viridis",
 ) -> None:
-    """Plot values of the map cells on the sheet, with unknown cells hatched; `texts`: title, label and colours."""
-    title, label, colours = texts
+    """Plot values of the map cells on the sheet, with unknown cells hatched."""
     known = np.where(unknown, np.nan, values)
     image = axes.imshow(known, colours, norm=norm, extent=(0, 1, 1, 0), interpolation="nearest")
     side = 1 / len(values)

@@ -1,7 +1,7 @@
 """Observed points: their positions, or their pixels in the scene's main camera, over time.
 
-Predictions interpolate the drawn surface between four mass points, interpolate linearly between frames, and project by
-the camera. The adjoints of the interpolations are their transposes; the projection has central differences.
+A prediction interpolates the drawn surface between four mass points, then linearly between frames; pixels are projected
+by the camera. The adjoint of an interpolation is its transpose, that of the projection consists of central differences.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from taichi_msm.render.camera import view_at
 from taichi_msm.runs.simulation import Simulation
 from taichi_msm.scene.scene import Scene
 
-# Largest ratio of the observed extent to the extent at rest, or of their inverse, in correct units.
+# Largest factor between the observed extent and that at rest, in either direction, for metres.
 MAX_EXTENT_RATIO = 30.0
 
 # Smallest significant root mean square of the motion of a point [sigma].
@@ -31,10 +31,10 @@ MIN_MOTION_SIGMAS = 1.5
 # Largest rounding error, as a share of the coordinates.
 ROUNDING_SHARE = 1e-9
 
-# Largest offset of the first observations from rest with a correct camera [px], or origin [share of the sheet].
+# Largest offset of the first observations from rest: of pixels [px]; of positions [share of the sheet].
 MAX_OFFSET_PX, MAX_OFFSET_SHARE = 3.0, 0.02
 
-# Smallest correlation of residuals with a warning.
+# Smallest correlation of residuals that is reported.
 MIN_ERROR_CORRELATION = 0.3
 
 
@@ -61,25 +61,25 @@ class PointModel(ObservationModel):
         return self.on_sheet(simulation.positions()[None])[0]
 
     def predict(self, recorded: Array) -> Array:
-        """Return the values of points in all frames, shape (frames, N, 3), as `observe` does."""
+        """Return the values, shape (N, T, 3 or 2); `recorded`: points at all frames [m], shape (frames, N, 3)."""
         return self.observe(self.interpolate(recorded))
 
     def motion(self, recorded: Array) -> Array:
-        """Return the largest displacement in every frame [m], shape (frames,), of points, shape (frames, N, 3)."""
+        """Return the largest displacement at every frame [m], shape (frames,); `recorded`: as for `predict`."""
         moved = recorded - self._observed.rest_positions(self.scene)
         return np.asarray(np.linalg.norm(moved, axis=2).max(axis=1))
 
     def on_sheet(self, position: Array) -> Array:
-        """Interpolate positions [m], shape (frames, rows, cols, 3), in space; returns shape (frames, N, 3)."""
+        """Return the points on the sheet [m], shape (frames, N, 3); `position`: shape (frames, rows, cols, 3)."""
         return np.array([self._surface @ frame.reshape(-1, 3) for frame in position])
 
     def interpolate(self, at_frames: Array) -> Array:
-        """Interpolate points, shape (frames, N, 3), in time; returns shape (N, T, 3)."""
+        """Return the points at the observed times [m], shape (N, T, 3), from `on_sheet`."""
         at_times = self._time_weights @ at_frames.reshape(len(at_frames), -1)
         return np.asarray(at_times.reshape(-1, *at_frames.shape[1:]).swapaxes(0, 1))
 
     def points(self, position: Array) -> Array:
-        """Interpolate positions [m], shape (frames, rows, cols, 3), in space and time; returns shape (N, T, 3)."""
+        """Return the observed points [m], shape (N, T, 3); `position`: shape (frames, rows, cols, 3)."""
         return self.interpolate(self.on_sheet(position))
 
     def observe(self, points: Array) -> Array:
@@ -100,7 +100,7 @@ class PointModel(ObservationModel):
 
 
 class Conventions(NamedTuple):
-    """Conventions of camera or origin, for messages about displaced points.
+    """Expected place of points at rest, and remedies for another camera or origin.
 
     Attributes:
         tolerance: largest offset of correct points at rest [m] or [px].
@@ -242,9 +242,9 @@ class PointObservation(Observation):
         # Distances are between mean pixels; tracks without observations are left out.
         is_tracked: NDArray[np.bool_] = np.any(self.is_observed, axis=1)
         space, time = np.eye(int(is_tracked.sum())), np.eye(len(self.time))
-        if correlation.correlation is not None:
+        if correlation.length is not None:
             pixels = np.nanmean(self.values[is_tracked], axis=1)
-            space = np.exp(-cdist(pixels, pixels) / correlation.correlation)
+            space = np.exp(-cdist(pixels, pixels) / correlation.length)
         if correlation.drift is not None:
             time = np.exp(-np.abs(self.time[:, None] - self.time) / correlation.drift)
         by_track = np.zeros((*self.values.shape, rows.shape[1]))
@@ -262,7 +262,7 @@ class PointObservation(Observation):
                 yield "the residual is almost 0, and so are the intervals; give the standard deviation by --sigma"
             return
         space_correlation, time_correlation = _residual_correlations(residuals, self.coordinates)
-        if space_correlation > MIN_ERROR_CORRELATION and correlation.correlation is None:
+        if space_correlation > MIN_ERROR_CORRELATION and correlation.length is None:
             remedy = f"; {self.correlation_remedy}" if self.correlation_remedy else ""
             fault = f"the residuals of neighbouring points are correlated (by {space_correlation:.2f})"
             yield f"{fault}, so that the intervals are too narrow{remedy}"
@@ -279,7 +279,7 @@ class PointObservation(Observation):
         return motion[np.isfinite(motion).any(axis=(1, 2))]
 
     def _mirrored_axes(self, scene: Scene) -> list[int]:
-        """Return the axes that are mirrored between the observed points and those at rest."""
+        """Return the axes along which the observed points mirror the points at rest."""
         count = self.is_observed.sum(axis=1)
         expected, observed = (
             np.where(self.known, each, 0.0).sum(axis=1)[count > 0, :2] / count[count > 0, None]
@@ -321,7 +321,7 @@ class Positions(PointObservation):
             MAX_OFFSET_SHARE * max(scene.sheet.size),
             "they are at rest in the scene",
             "count from the sheet's middle, x right, y up, z toward the viewer",
-            ("-x, right of the middle above 0", "-y, above the middle above 0"),
+            ("-x, positive right of the middle", "-y, positive above the middle"),
         )
 
     def faults(self, scene: Scene) -> Iterator[str]:
@@ -346,7 +346,7 @@ class Positions(PointObservation):
 class Pixels(PointObservation):
     """Pixels of points [px], from the upper left corner of the picture; values of shape (N, T, 2).
 
-    Points behind the camera, or beyond its lens, have no pixel. The projection has central differences.
+    Points behind the camera, or beyond its lens, have no pixel.
     """
 
     kind: ClassVar[str] = "pixel"
@@ -386,7 +386,7 @@ class Pixels(PointObservation):
             yield f"{self.subject}: up to {largest:.3g}; {fault}, {width} and {height} in the scene"
 
     def _offset_faults(self, scene: Scene, predicted: Array) -> Iterator[str]:
-        """Yield a message about another camera, or about a half-pixel offset of points at rest, within 0.02 px."""
+        """Yield messages about another camera, and about half a pixel of offset at points that are still at rest."""
         yield from super()._offset_faults(scene, predicted)
         rest = self.at_rest(scene)
         is_at_rest = self.is_observed & (np.linalg.norm(predicted - rest, axis=2) < 0.02)
@@ -399,7 +399,8 @@ class Pixels(PointObservation):
         mean, error = offsets.mean(axis=0), np.maximum(offsets.std(axis=0, ddof=1) / np.sqrt(len(offsets)), sigma_error)
         halves = np.where(np.abs(mean) < 0.25, 0.0, 0.5 * np.sign(mean))
         distance = np.abs(np.stack([mean, np.median(offsets, axis=0)]) - halves).max(axis=0)
-        # A half-pixel offset: the mean is within 3 standard errors of 0 or a half, precise, and significant [px].
+        # Half a pixel of offset [px]: the means of both axes are precise and within 3 standard errors of 0 or a half,
+        # and one of the halves is significant.
         is_half = (distance <= 3.0 * error + 0.02) & (error < 0.1)
         if is_half.all() and ((halves != 0) & (np.abs(mean) > 5.0 * error)).any():
             shown = " and ".join(f"{offset:+.2g} px in {axis}" for offset, axis in zip(mean, "xy", strict=True))

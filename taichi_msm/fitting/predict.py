@@ -49,7 +49,7 @@ class FitProblem:
     """Scene, parameters and observations of a fit.
 
     Attributes:
-        signs: signs of the finite differences at the solution.
+        signs: sides of the finite differences at the solution: (1, -1) central, (1,) forward.
         token: identifier of the fit in worker processes.
         scene: scene with its initial values.
         parameters: parameters of the fit.
@@ -77,7 +77,7 @@ class FitProblem:
         """Return a scene's data with parameter values.
 
         Args:
-            data: data of a scene, as of `as_data`.
+            data: data of a scene, from `as_data`.
             values: values of all parameters by key.
         """
         return with_values(data, self.parameters, values)
@@ -110,7 +110,7 @@ class ForwardModel:
         x: Array,
         steps: int | None = None,
         *,
-        coarse: int = 0,
+        halvings: int = 0,
         to_end: bool = False,
         pause: Pause = lambda: None,
     ) -> Prediction:
@@ -119,7 +119,7 @@ class ForwardModel:
         Args:
             x: coordinates of the parameters, shape (n,).
             steps: smallest number of steps per frame; by default enough for finite differences around x.
-            coarse: number of halvings of the cells per side.
+            halvings: number of halvings of the cells per side.
             to_end: whether to simulate to the last frame, beyond the last observation.
             pause: called several times a second; an exception from it ends the run.
 
@@ -127,7 +127,7 @@ class ForwardModel:
             SceneError: when the scene with these values is not valid, or has too few mass points to be coarsened.
             DivergedError: when the run diverges.
         """
-        simulation, plan = self.start(self.plan(x), steps, coarse)
+        simulation, plan = self.start(self.plan(x), steps, halvings)
         # The mesh of a coarse run differs.
         models = [observed.build_model(plan.scene, self._frames) for observed in self.problem.observations]
         frames = max(self._frames, plan.grid.frames + 1) if to_end else self._frames
@@ -136,13 +136,13 @@ class ForwardModel:
         motion = np.max([model.motion(recorded) for model, recorded in pairs], axis=0)
         return Prediction(values, plan.grid.steps_per_frame, motion)
 
-    def start(self, plan: Plan, steps: int | None, coarse: int) -> tuple[Simulation, Plan]:
+    def start(self, plan: Plan, steps: int | None, halvings: int) -> tuple[Simulation, Plan]:
         """Restart the simulation.
 
         Args:
             plan: plan of the run.
-            steps: smallest number of steps per frame, or None, as of `predict`.
-            coarse: number of halvings of the cells per side.
+            steps: smallest number of steps per frame; None as for `predict`.
+            halvings: number of halvings of the cells per side.
 
         Returns:
             The simulation, and its plan with these cells and steps.
@@ -150,7 +150,7 @@ class ForwardModel:
         Raises:
             SceneError: when the plan has too few mass points to be coarsened.
         """
-        for _ in range(coarse):
+        for _ in range(halvings):
             if (coarser := coarser_plan(plan)) is None:
                 raise SceneError(["sheet.points: too few to take half of them"])
             plan = coarser
@@ -166,11 +166,11 @@ class ForwardModel:
             self._simulation.restart(plan)
         return self._simulation, plan
 
-    def compile(self, x: Array, pause: Pause = lambda: None) -> None:
-        """Compile the kernels.
+    def compile(self, x: Array, pause: Pause) -> None:
+        """Compile the kernels; raise a SceneError if the scene at x is invalid.
 
         Args:
-            x: coordinates of the parameters, shape (n,); raises a SceneError as `predict` does.
+            x: coordinates of the parameters, shape (n,).
             pause: called several times a second.
         """
         self._simulation = Simulation(self.plan(x), threads=self._threads)
@@ -181,7 +181,7 @@ class ForwardModel:
 
         Args:
             x: coordinates of the parameters, shape (n,).
-            steps: smallest number of steps per frame, or None, as of `predict`.
+            steps: smallest number of steps per frame; None as for `predict`.
             options: further arguments of `predict`.
         """
         try:
@@ -206,7 +206,7 @@ class ForwardModel:
     def record(
         self, models: Sequence[ObservationModel], simulation: Simulation, frames: int, pause: Pause
     ) -> list[Array]:
-        """Return the records of a run, a stack over all frames per model.
+        """Return the records of a run: for each model those of all frames, stacked.
 
         Args:
             models: observation models.
@@ -239,13 +239,13 @@ def difference_step(scene: Scene) -> float:
 _cached_models: dict[str, ForwardModel] = {}
 
 
-def predict(problem: FitProblem, x: Array, steps: int | None) -> Prediction | None:
-    """Return the prediction of a worker process on one thread, as `ForwardModel.try_predict` does.
+def predict_in_worker(problem: FitProblem, x: Array, steps: int | None) -> Prediction | None:
+    """Return the result of `ForwardModel.try_predict` in a worker process, on one thread.
 
     Args:
         problem: the fit; its forward model is kept for the next call.
         x: coordinates of the parameters, shape (n,).
-        steps: smallest number of steps per frame, or None, as of `ForwardModel.predict`.
+        steps: smallest number of steps per frame; None as for `ForwardModel.predict`.
     """
     if problem.token not in _cached_models:
         for token in list(_cached_models):
@@ -278,7 +278,7 @@ class Runs:
 
     Args:
         problem: the fit.
-        workers: number of worker processes, without a pool if it is 1; by default by the duration of the first run.
+        workers: number of worker processes, 1 for no pool; by default chosen by the duration of the first run.
         progress: called often with the stage, the finished and the expected number of runs; an exception from it ends
             the fit.
     """
@@ -287,15 +287,15 @@ class Runs:
         self.problem = problem
         self.count = self.expected = 0  # number of finished runs, and the expected number
         self._workers, self._progress = workers, progress
-        self._predictor = problem.build_model(threads=None)
+        self._model = problem.build_model(threads=None)
         self._pool: Pool | None = None
         self._seconds = 0.0
 
-    def first(self, x: Array) -> Prediction:
-        """Return the prediction at x to the last frame; raises as `ForwardModel.predict` does."""
-        self._predictor.compile(x, self._report_progress)
+    def predict_initial(self, x: Array) -> Prediction:
+        """Compile, and return the prediction at x to the last frame; raise the errors of `ForwardModel.predict`."""
+        self._model.compile(x, self._report_progress)
         start = time.perf_counter()
-        predicted = self._predictor.predict(x, to_end=True, pause=self._report_progress)
+        predicted = self._model.predict(x, to_end=True, pause=self._report_progress)
         self._seconds, self.count = time.perf_counter() - start, self.count + 1
         return predicted
 
@@ -307,21 +307,21 @@ class Runs:
             halvings: number of halvings of the cells per side.
         """
         self.count += 1
-        return self._predictor.try_predict(x, coarse=halvings, pause=self._report_progress)
+        return self._model.try_predict(x, halvings=halvings, pause=self._report_progress)
 
     def mesh_error(self, x: Array) -> float | None:
         """Return the estimated mesh error at x, as the function `mesh_error` does."""
-        return mesh_error(self._predictor.plan(x), self._report_progress)
+        return mesh_error(self._model.plan(x), self._report_progress)
 
     def predict_one(self, x: Array, steps: int | None = None) -> Prediction | None:
         """Return the prediction at x, or None if it fails.
 
         Args:
             x: coordinates of the parameters, shape (n,).
-            steps: smallest number of steps per frame, or None, as of `ForwardModel.predict`.
+            steps: smallest number of steps per frame; None as for `ForwardModel.predict`.
         """
         self._report_progress()
-        predicted = self._predictor.try_predict(x, steps, pause=self._report_progress)
+        predicted = self._model.try_predict(x, steps, pause=self._report_progress)
         self.count += 1
         return predicted
 
@@ -330,7 +330,7 @@ class Runs:
 
         Args:
             coordinates: coordinates of the parameters of every run, each of shape (n,).
-            steps: smallest number of steps per frame, or None, as of `ForwardModel.predict`.
+            steps: smallest number of steps per frame; None as for `ForwardModel.predict`.
 
         Raises:
             ExecutorError: when a worker process dies.
@@ -339,7 +339,7 @@ class Runs:
             self._pool = Pool(workers)
         if self._pool is None or len(coordinates) < 2:
             return [self.predict_one(x, steps) for x in coordinates]
-        futures: list[Future[Any]] = [self._pool.submit(predict, self.problem, x, steps) for x in coordinates]
+        futures: list[Future[Any]] = [self._pool.submit(predict_in_worker, self.problem, x, steps) for x in coordinates]
         waiting = set(futures)
         while waiting:
             self._report_progress()
@@ -369,4 +369,4 @@ class Runs:
     def __exit__(self, kind: object, *_: object) -> None:
         if self._pool is not None:
             self._pool.shutdown(cancel_futures=kind is not None)
-        self._predictor.close()
+        self._model.close()

@@ -2,7 +2,7 @@
 
 A parameter is fixed, and the others are optimised within their bounds by Gauss-Newton steps, a run each, with the
 Jacobian of the solution. The interval ends where sqrt(2 rise of the cost / f) is Student's t times the widening by
-correlated errors.
+correlated errors; f is that of `uncertainty`.
 """
 
 from __future__ import annotations

@@ -1,9 +1,11 @@
 """Rejection of a model by an improbable chi-square, or by correlated residuals.
 
-Residuals of successive times, or of neighbouring points, are multiplied. For independent errors the products have a
-mean of 0 and are uncorrelated, even if two products share a point; Student's t tests this mean. Clipped residuals limit
-the weight of jumps. Drift of tracks is allowed for by sums of the products of neighbours over time; a given correlation
-of neighbours by sums of the products of successive times over points.
+The test for correlation multiplies residuals of neighbouring points, or of successive times. For independent errors
+the products have a mean of 0 and are uncorrelated, even if two products share a point; Student's t tests this mean.
+Clipped residuals limit the weight of jumps.
+
+Tracks may drift: products of neighbours are first summed over time. With a given correlation of neighbours, products of
+successive times are first summed over points.
 """
 
 from __future__ import annotations
@@ -45,7 +47,7 @@ def by_pattern(
         time: times of the observations [s], shape (T,).
         coordinates: coordinates of the points on the sheet, shape (N, 2).
         motion: root mean square of the observed motion [m] or [px].
-        error_correlation: given correlation lengths of the errors.
+        error_correlation: given correlation of the errors.
         remedy: remedy for correlated errors of neighbouring points, for the reason.
     """
     # Smaller residuals are due to rounding and the tolerance of the search.
@@ -53,14 +55,14 @@ def by_pattern(
         return None
     limit = 4.0 * np.nanmedian(np.abs(residuals))
     clipped = np.nan_to_num(np.clip(residuals, -limit, limit))[:, np.argsort(time)]
-    if error_correlation.correlation is None:
+    if error_correlation.length is None:
         first, second = _neighbours(coordinates)
-        if _has_mean((clipped[first] * clipped[second]).sum(axis=(1, 2)), 24):
-            fault = "the residuals of neighbouring points are correlated, unlike independent errors"
-            return f"{fault}; if the errors are, {remedy}"
+        if _is_positive((clipped[first] * clipped[second]).sum(axis=(1, 2)), 24):
+            reason = "the residuals of neighbouring points are correlated, unlike independent errors"
+            return f"{reason}; for correlated errors {remedy}"
     if error_correlation.drift is None:
         products = (clipped[:, 1:] * clipped[:, :-1]).sum(axis=2)
-        if _has_mean(products.ravel() if error_correlation.correlation is None else products.sum(axis=0), 4):
+        if _is_positive(products.ravel() if error_correlation.length is None else products.sum(axis=0), 4):
             reason = "the residuals of a point are correlated in time, unlike independent errors"
             return f"{reason}; if the tracks drift, give --drift SECONDS"
     return None
@@ -77,7 +79,7 @@ def _neighbours(coordinates: Array) -> tuple[NDArray[np.intp], NDArray[np.intp]]
     return pairs[:, 0], pairs[:, 1]
 
 
-def _has_mean(products: Array, min_count: int) -> bool:
+def _is_positive(products: Array, min_count: int) -> bool:
     """Return whether the mean of the products is significantly positive; False for fewer than `min_count`."""
     from scipy.stats import t
 

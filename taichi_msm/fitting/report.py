@@ -7,9 +7,7 @@ from __future__ import annotations
 
 import json
 import shutil
-from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import yaml
@@ -18,7 +16,7 @@ from PIL import Image
 
 from taichi_msm.errors import printable
 from taichi_msm.fitting.result import FitResult, FittedMap, sixteen_bits
-from taichi_msm.runs.directory import IsListed, Publication, PublicationSpec, create_file, list_files, write_new_file
+from taichi_msm.runs.directory import Publication, PublicationSpec, create_file, list_files, write_new_file
 from taichi_msm.scene.scene import Scene
 from taichi_msm.system.compiler import versions
 
@@ -29,15 +27,10 @@ MAP, ERRORS = FittedMap.FILE, "map-error.png"
 PATTERNS = (r"fit\.json", r"scene(-\d+)?\.yaml", r"fit\.png", r"map\.png", r"map-error\.png", rf"{PICTURES}/.+")
 
 
-def _is_fit_file(record: Mapping[str, Any]) -> IsListed:
-    return {RECORD, *record["files"]}.__contains__
-
-
 def publication(directory: Path) -> Publication:
     """Return the atomic replacement of a fit in a directory."""
-    return Publication(
-        directory, PublicationSpec("fit", RECORD, PATTERNS, _is_fit_file), [RECORD, SCENE, PLOT, MAP, ERRORS]
-    )
+    spec = PublicationSpec("fit", RECORD, PATTERNS, lambda record: {RECORD, *record["files"]}.__contains__)
+    return Publication(directory, spec, [RECORD, SCENE, PLOT, MAP, ERRORS])
 
 
 def write_report(result: FitResult, published: Publication) -> None:

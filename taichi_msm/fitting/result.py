@@ -10,13 +10,13 @@ from typing import Any, ClassVar, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from taichi_msm.fitting.identifiability import UnidentifiedGroup
 from taichi_msm.fitting.machine_fit import FittedTest
 from taichi_msm.fitting.observation import Array, Observation
 from taichi_msm.fitting.parameters import rounded
 from taichi_msm.fitting.points import PointObservation
 from taichi_msm.fitting.profiles import ProfilePoint
 from taichi_msm.fitting.tikhonov import SmoothnessWeight
+from taichi_msm.fitting.uncertainty import UnidentifiedGroup
 from taichi_msm.scene.scene import Scene
 
 
@@ -117,9 +117,9 @@ class FitResult:
         sigma: standard deviation of the values [m] or [px], given or estimated, or None without points.
         unit: unit of residual and sigma, m or px.
         chi_square: sum of (predicted - observed)^2 / sigma^2, or None without a given sigma.
-        degrees_of_freedom: number of observed numbers, minus the number of parameters except for a map.
+        degrees_of_freedom: number of observed numbers, of a fit of numbers less the number of parameters.
         identifiable: whether all parameters are identifiable.
-        unseen: groups of parameters that are not identifiable, or in combinations only.
+        unseen: groups of parameters that are not identifiable one by one.
         mesh_error: mesh error of the fitted scene, as a fraction of its largest displacement, or None if unknown.
         runs: number of runs.
         seconds: duration [s].
@@ -164,12 +164,14 @@ class FitResult:
 
     def as_json(self) -> dict[str, Any]:
         """Return JSON data, as in fit.json."""
-        names = "model_rejected correlation residual residual_force sigma sigma_force unit chi_square "
-        names += "degrees_of_freedom identifiable mesh_error"
+        names = (
+            "model_rejected correlation residual residual_force sigma sigma_force unit chi_square degrees_of_freedom "
+            "identifiable mesh_error runs seconds notes"
+        )
         return {
             "observed": self.observations[0].name,
             "parameters": {key: item._asdict() for key, item in self.parameters.items()},
-            **{name: getattr(self, name) for name in (*names.split(), "runs", "seconds", "notes")},
+            **{name: getattr(self, name) for name in names.split()},
             "unseen": [item.as_json() for item in self.unseen],
             **({} if self.map is None else {"map": self.map.as_json()}),
             **({"tests": [fitted.as_json() for fitted in self.tests]} if self.tests else {}),

@@ -12,7 +12,6 @@ import numpy as np
 from taichi_msm.accuracy.mesh import coarser_plan
 from taichi_msm.errors import SceneError, StageProgressCallback
 from taichi_msm.fitting.checks import faults, faults_at_start
-from taichi_msm.fitting.identifiability import MAX_RELATIVE_ERROR
 from taichi_msm.fitting.observation import Array
 from taichi_msm.fitting.parameters import Bounds, Parameter, make_parameters, rounded
 from taichi_msm.fitting.points import PointModel, PointObservation
@@ -21,6 +20,7 @@ from taichi_msm.fitting.profiles import ProfilePoint
 from taichi_msm.fitting.rejection import by_chi_square
 from taichi_msm.fitting.result import Estimate, FitResult, FittedMap
 from taichi_msm.fitting.tikhonov import MapGrid, MapSearch, MapSolution, centres, with_scaled_forces
+from taichi_msm.fitting.uncertainty import MAX_RELATIVE_ERROR
 from taichi_msm.gradients.gradient import Adjoint, require_differentiable
 from taichi_msm.load.check import check_scene
 from taichi_msm.model.plan import Plan
@@ -79,10 +79,8 @@ def map_settings(
     option = f"--free {KEY}"
     force_keys = [key for key in free if key != KEY]
     if conflicting := [key for key in force_keys if not FORCE_KEY.fullmatch(key)] + force_keys[1:]:
-        reason = (
-            f"only a map alone is identifiable, as {conflicting[0]} can have the effect of its level; leave that out"
-        )
-        raise SceneError([f"{option}: {reason}, or free one component of a force, whose factor all forces share"])
+        fault = f"not with {conflicting[0]}, which can have the effect of the level of the map; leave it out"
+        raise SceneError([f"{option}: {fault}, or free one component of a force, whose factor scales all forces"])
     if scene.tissue is None:
         raise SceneError([f"{option}: the scene has springs; describe them as tissue"])
     cells = min(scene.sheet.points) - 1
@@ -93,7 +91,7 @@ def map_settings(
         raise SceneError([f"--resolution {resolution}: {remedy}"])
     if unknown := [key for key in bounds if key not in free]:
         raise SceneError([f"--bounds {unknown[0]}: not among --free; take {KEY}=LOW,HIGH, factors of young"])
-    low, high = bounds.get(KEY, (DEFAULT_LOW, DEFAULT_HIGH))
+    low, high = bounds.get(KEY, (-math.inf, math.inf))
     low, high = (DEFAULT_LOW if low == -math.inf else low), (DEFAULT_HIGH if high == math.inf else high)
     interval = f"--bounds {KEY}={low:g},{high:g}"
     if not 0 < low < high:
@@ -146,15 +144,17 @@ def fit_map(
 
     search: MapSearch | None = None
     report_progress()
-    position = adjoint.run(grid.factors(start[:cell_count]), report_progress)
-    points = _initial_points(position, model, observations, scene)
+    at_frames = model.on_sheet(adjoint.run(grid.factors(start[:cell_count]), report_progress))
+    initial = model.predict(at_frames)
+    if invalid := list(faults_at_start([observations], scene, Prediction((initial,), 0, model.motion(at_frames)))):
+        raise SceneError(invalid)
     mesh_shift = 0.0
     if (coarse_plan := coarser_plan(plan)) is not None:
         coarse_factors = MapGrid(settings.resolution, _cells(coarse_plan)).factors(start[:cell_count])
         coarse_model = PointModel(coarse_plan.scene, observations, coarse_plan.grid.frames + 1)
         coarse_points = coarse_model.points(Adjoint(coarse_plan, device).run(coarse_factors, report_progress))
         # Richardson extrapolation of order 2, from half the cells per side.
-        differences = (coarse_model.observe(coarse_points) - model.observe(points))[observations.known] / 3.0
+        differences = (coarse_model.observe(coarse_points) - initial)[observations.known] / 3.0
         mesh_shift = float(np.sqrt(np.nanmean(differences**2)))
     sigma = math.hypot(observations.sigma, mesh_shift)
     force_limits = settings.force.limits if settings.force else None
@@ -168,7 +168,7 @@ def fit_map(
     assert scene.tissue is not None
     update = {"map": StiffnessMap(image=image, range=fitted_map.range)}
     fitted_scene = scene.model_copy(update={"tissue": scene.tissue.model_copy(update=update)})
-    fitted_scene = with_scaled_forces(fitted_scene, *np.exp(solution.x[cell_count:]).tolist())
+    fitted_scene = with_scaled_forces(fitted_scene, solution.x[cell_count:])
     estimates, curves = {}, {}
     if settings.force is not None:
         key = settings.force.key
@@ -226,16 +226,6 @@ def _faults(observations: PointObservation, scene: Scene, settings: MapSettings)
     yield from faults([observations], scene, settings.resolution**2)
 
 
-def _initial_points(position: Array, model: PointModel, observations: PointObservation, scene: Scene) -> Array:
-    """Return the observed points in the initial run [m], shape (N, T, 3); raise a SceneError if implausible."""
-    at_frames = model.on_sheet(position)
-    points = model.interpolate(at_frames)
-    prediction = Prediction((model.observe(points),), 0, model.motion(at_frames))
-    if invalid := list(faults_at_start([observations], scene, prediction)):
-        raise SceneError(invalid)
-    return points
-
-
 def _with_stable_steps(plan: Plan, high: float) -> Plan:
     """Return the plan with steps stable up to the factor `high`; raise a SceneError if a fixed step is not."""
     if plan.scene.time.at_rest:
@@ -272,18 +262,17 @@ def _notes(
     limits: tuple[float, float],
     residuals: Array,
 ) -> Iterator[str]:
-    """Yield warnings; `residuals` are in [m] or [px]."""
+    """Yield warnings; `limits`: bounds of the logs of the factors, `residuals`: of all known values [m] or [px]."""
     assert observations.sigma is not None
     if (unknown_count := int(fitted_map.unknown.sum())) > 0:
         yield f"{unknown_count} of {fitted_map.factors.size} cells are unknown, as nothing moves there; press there"
     if mesh_shift > observations.sigma / 2:
-        size = f"about {rounded(mesh_shift)} {observations.unit}, and sigma is {rounded(observations.sigma)}"
-        remedy = "the map is as smooth as both require; take more sheet.points"
-        yield f"the mesh changes the observations by {size}: {remedy}"
+        shift = f"{rounded(mesh_shift)} {observations.unit} (sigma: {rounded(observations.sigma)})"
+        yield f"the mesh changes the observations by about {shift}, and smooths the map; take more sheet.points"
     if (share := float(np.sqrt(np.mean(residuals**2))) / observations.sigma) < 0.5:
         yield f"the residual is only {rounded(share)} times sigma: with a smaller sigma the map shows more"
-    if solution.excess > 1.5:
-        factor = rounded(math.sqrt(solution.excess))
+    if solution.variance > 1.5:
+        factor = rounded(math.sqrt(solution.variance))
         yield f"the residual is {factor} times the expected one with any map, and the errors are widened by this factor"
     logs = solution.x[: fitted_map.factors.size]
     if bounded := int((np.minimum(logs - limits[0], limits[1] - logs) < 1e-3).sum()):

@@ -1,16 +1,19 @@
 """Tikhonov-regularised estimation of a stiffness map on a grid of R x R cells.
 
+The logs x of the factors of the map cells minimise, within bounds, chi-square plus a penalty on roughness,
+
     1/2 sum ((predicted - observed) / sigma)^2 + w/2 sum (x_p - x_q)^2        over all neighbouring map cells p, q
 
-is minimised over the logs x of the factors of all map cells, within bounds, by L-BFGS-B with the adjoint gradient. The
-weight w is the largest one with residuals that sigma explains: the discrepancy principle. As only R^2 degrees of
-freedom of the residuals depend on the map, the excess of chi-square above its minimum is compared with its expectation,
-R^2 minus the effective number of parameters, tr(J^T J (J^T J + w L)^-1), with sigma = 1. J is the
-Jacobian of the predictions by x, L the matrix of the second sum. J is evaluated again at the end of a search, until the
-weight is stable.
+The minimiser is L-BFGS-B with the adjoint gradient. J is the Jacobian of predicted / sigma by x, L the matrix of the
+second sum.
 
-Standard errors are those of Laplace's approximation, from the inverse of J^T J + w L, and valid for smooth tissue only.
-A map cell is unknown if its error would exceed MAX_KNOWN_ERROR even with all other cells given.
+The weight w follows from the discrepancy principle: it is the largest with residuals that sigma explains. The map
+changes only R^2 degrees of freedom of the residuals. Therefore the excess of chi-square above its minimum is compared
+with its expectation, R^2 minus the effective number of parameters, tr(J^T J (J^T J + w L)^-1). As J depends on x,
+search and choice of w alternate until w is stable.
+
+Standard errors are those of Laplace's approximation, from the inverse of J^T J + w L; they hold for smooth tissue only.
+A map cell is unknown if its error would exceed `MAX_KNOWN_ERROR` even with all other cells given.
 """
 
 from __future__ import annotations
@@ -34,7 +37,7 @@ MAX_KNOWN_ERROR = 0.5
 # Largest change of a stable weight, as a factor.
 MAX_WEIGHT_CHANGE = 2.0
 
-# Largest step of the log of a map cell from the linearised solution, as the start of a search.
+# Largest change of the log of a map cell by the linearised solution, at which a search starts.
 MAX_INITIAL_STEP = 1.0
 
 # Step of finite differences of the log of a map cell.
@@ -46,7 +49,7 @@ class SmoothnessWeight(NamedTuple):
 
     Attributes:
         weight: w.
-        step: change of x to the minimum with w, linearised, shape (R^2,).
+        step: linearised change of x to the minimum with w, shape (R^2,).
         weights: candidates, from the largest to w, shape (candidates,).
         excess: excess of chi-square above its minimum, for each candidate, shape (candidates,).
         expected: expected excess, shape (candidates,).
@@ -59,13 +62,14 @@ class SmoothnessWeight(NamedTuple):
     expected: Array
 
 
-def with_scaled_forces(scene: Scene, factor: float = 1.0) -> Scene:
+def with_scaled_forces(scene: Scene, logs: Array) -> Scene:
     """Return a scene with scaled forces of all tools.
 
     Args:
         scene: the scene.
-        factor: common factor of the forces.
+        logs: log of the common factor of the forces, shape (1,); empty for unchanged forces.
     """
+    factor = float(np.exp(logs).prod())
     totals = [probe.total and tuple(factor * component for component in probe.total) for probe in scene.probes]
     probes = [probe.model_copy(update={"total": total}) for probe, total in zip(scene.probes, totals, strict=True)]
     return scene.model_copy(update={"probes": tuple(probes)})
@@ -77,15 +81,15 @@ class Linearisation:
 
     Attributes:
         x: logs of the factors of the map cells, shape (R^2,).
-        information: J^T J / excess, shape (R^2, R^2).
-        slope: gradient of chi-square / (2 excess) by x, shape (R^2,).
-        excess: chi-square of the best map per degree of freedom, at least 1.
+        information: J^T J / variance, shape (R^2, R^2).
+        slope: gradient of chi-square / (2 variance) by x, shape (R^2,).
+        variance: variance of the residuals [sigma^2], chi-square of the best map per degree of freedom; at least 1.
     """
 
     x: Array
     information: Array
     slope: Array
-    excess: float
+    variance: float
 
     def choose_weight(self, roughness: Array) -> SmoothnessWeight:
         """Choose the weight of L, `roughness`, shape (R^2, R^2), by the discrepancy principle."""
@@ -119,13 +123,13 @@ class MapSolution:
     Attributes:
         x: logs of the factors, and of the factor of the forces if free, shape (R^2,) or (R^2 + 1,).
         errors: standard errors of x, NaN if unknown.
-        excess: chi-square of the best map per degree of freedom, at least 1.
+        variance: variance of the residuals [sigma^2], as in `Linearisation`.
         choice: weight of the smoothness.
     """
 
     x: Array
     errors: Array
-    excess: float
+    variance: float
     choice: SmoothnessWeight
 
 
@@ -170,7 +174,7 @@ class MapSearch:
         """Return predicted points [m], shape (N, T, 3), and values, shape (N, T, 3 or 2)."""
         self._pause()
         self.runs += 1
-        cells, scene = x[: self._cells], with_scaled_forces(self._model.scene, *np.exp(x[self._cells :]))
+        cells, scene = x[: self._cells], with_scaled_forces(self._model.scene, x[self._cells :])
         points = self._model.points(self._adjoint.run(self._grid.factors(cells), self._pause, scene))
         predicted = self._model.observe(points)
         if not np.isfinite(predicted[self._observations.known]).all():
@@ -186,7 +190,7 @@ class MapSearch:
         gradient = self._adjoint.backward(self._model.backward(points, 2 * residuals / self._sigma), self._pause)
         by_cells = self._grid.backward(x[: self._cells], gradient.maps["tissue.map"])
         # The derivative of a force by the log of its factor is the force.
-        scene = with_scaled_forces(self._model.scene, *np.exp(x[self._cells :]))
+        scene = with_scaled_forces(self._model.scene, x[self._cells :])
         totals = {f"probes.{n}.total": np.array(probe.total, np.float64) for n, probe in enumerate(scene.probes)}
         by_forces = sum(float(np.sum(gradient.numbers[key] * total)) for key, total in totals.items())
         return float((residuals**2).sum()), np.append(by_cells, [by_forces] * (len(x) - self._cells))
@@ -198,13 +202,13 @@ class MapSearch:
         # Weight and map alternate.
         for _ in range(4):
             weight, step = choice.weight, np.clip(choice.step, -MAX_INITIAL_STEP, MAX_INITIAL_STEP)
-            x = self._minimise(np.clip(linearisation.x + step, *self._limits), weight, linearisation.excess)
+            x = self._minimise(np.clip(linearisation.x + step, *self._limits), weight, linearisation.variance)
             linearisation = self._linearise(x)
             choice = linearisation.choose_weight(self._roughness)
             if 1 / MAX_WEIGHT_CHANGE < choice.weight / weight < MAX_WEIGHT_CHANGE:
                 break
         errors = linearisation.errors(weight, self._roughness)
-        return MapSolution(x, errors, linearisation.excess, choice._replace(weight=weight))
+        return MapSolution(x, errors, linearisation.variance, choice._replace(weight=weight))
 
     def _linearise(self, x: Array) -> Linearisation:
         """Linearise at x by finite differences, a run per map cell."""
@@ -215,17 +219,17 @@ class MapSearch:
             jacobian[:, n] = (self.predict(x + change)[1] - predicted)[known] / (DIFFERENCE_STEP * self._sigma)
         information, slope = jacobian.T @ jacobian, jacobian.T @ residuals
         min_chi_square = float(residuals @ residuals - slope @ np.linalg.pinv(information, hermitian=True) @ slope)
-        excess = max(1.0, min_chi_square / max(1, residuals.size - len(x)))
-        return Linearisation(x, information / excess, slope / excess, excess)
+        variance = max(1.0, min_chi_square / max(1, residuals.size - len(x)))
+        return Linearisation(x, information / variance, slope / variance, variance)
 
-    def _minimise(self, start: Array, weight: float, excess: float) -> Array:
-        """Minimise for a weight, with chi-square divided by `excess`."""
+    def _minimise(self, start: Array, weight: float, variance: float) -> Array:
+        """Minimise for a weight, with chi-square divided by the variance."""
         from scipy.optimize import minimize
 
         def cost(x: Array) -> tuple[float, Array]:
             (chi_square, gradient), smoothness_gradient = self.misfit(x), self._roughness @ x
-            value = chi_square / excess + weight * float(x @ smoothness_gradient)
-            return value / 2, gradient / excess / 2 + weight * smoothness_gradient
+            value = chi_square / variance + weight * float(x @ smoothness_gradient)
+            return value / 2, gradient / variance / 2 + weight * smoothness_gradient
 
         options = {"maxcor": 50, "ftol": 1e-6, "gtol": 0.0, "maxiter": 300}
         bounds = list(zip(*self._limits, strict=True))
@@ -234,7 +238,7 @@ class MapSearch:
 
 
 class MapGrid:
-    """Interpolation between the R x R cells of a map and the cells of a sheet, as by `sheet.map_factors`.
+    """Interpolation from the R x R cells of a map to the cells of a sheet, that of `model.sheet.map_factors`.
 
     Args:
         resolution: R.
@@ -263,7 +267,7 @@ class MapGrid:
         return np.asarray(np.exp(x) * (self._down.T @ gradient @ self._across).ravel())
 
     def roughness(self) -> Array:
-        """Return L, shape (R^2, R^2), where x L x is the sum of squared differences of neighbouring map cells."""
+        """Return L, shape (R^2, R^2): x L x is the sum of squared differences of neighbouring map cells."""
         steps, identity = np.diff(np.eye(self.resolution), axis=0), np.eye(self.resolution)
         line = steps.T @ steps
         return np.kron(line, identity) + np.kron(identity, line)

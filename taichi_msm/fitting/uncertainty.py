@@ -4,31 +4,44 @@ With J the Jacobian of the residuals r by x, the covariance of x is
 
     C = f (J^T W J)^-1 M (J^T W J)^-1,    M = J^T W^(1/2) K W^(1/2) J
 
-with W = 1 and K = 1, and f the mean of r^2 per degree of freedom, at least 1. In a robust fit W is the second
-derivative of rho / 2, and f the mean square of its first derivative over the mean of W. K is the correlation of the
-errors: exp(-distance / correlation) for two tracks at a time, exp(-interval / drift) for a track at two times, or the
-product of both. With the singular value decomposition W^(1/2) J = U S V^T,
+- W is 1; in a robust fit the second derivative of rho / 2.
+- f, at least 1, is the mean of r^2 per degree of freedom; in a robust fit the mean square of the first derivative of
+  rho / 2, over the mean of W.
+- K, the correlation of the errors, is 1; of tracks exp(-distance / length) at one time, exp(-interval / drift) of one
+  track, or the product of both.
+
+With the singular value decomposition W^(1/2) J = U S V^T,
 
     C = f V S^-1 (U^T K U) S^-1 V^T
 
 which avoids the squared condition number of J^T W J.
+
+Directions, columns of V, with large standard deviations are unidentified: images alone, for example, determine only the
+ratio of stiffness to force. Parameters that share such directions form a group, whose combinations orthogonal to these
+directions are identifiable.
 """
 
 from __future__ import annotations
 
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from taichi_msm.fitting.least_squares import Misfit, Scales, Solution
 from taichi_msm.fitting.observation import Array, ErrorCorrelation
-
-# Smaller components of unidentified directions are 0.
-MIN_COMPONENT = 1e-3
+from taichi_msm.fitting.parameters import Parameter, rounded
 
 # Largest standard deviation of an identified direction.
 MAX_DIRECTION_DEVIATION = 0.5
+
+# Smaller components of unidentified directions are 0; larger ones than the second make a parameter unidentified.
+MIN_COMPONENT, MIN_GROUP_COMPONENT = 1e-3, 0.05
+
+# Largest standard error of an identifiable parameter, as a share of its value or of a coordinate's range.
+MAX_RELATIVE_ERROR = 1.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -81,15 +94,19 @@ class Uncertainty:
         return float(t.ppf((1 + 0.95) / 2, self.freedom))
 
     @property
+    def unidentified_directions(self) -> Array:
+        """Columns of V with large standard deviations, shape (n, m)."""
+        return self.directions[:, self.direction_deviations > MAX_DIRECTION_DEVIATION]
+
+    @property
     def unidentified(self) -> NDArray[np.bool_]:
         """Mask of the parameters in unidentified directions, where `shift` is invalid, shape (n,)."""
-        directions = self.directions[:, self.direction_deviations > MAX_DIRECTION_DEVIATION]
-        return np.linalg.norm(directions, axis=1) > MIN_COMPONENT * 50
+        return np.linalg.norm(self.unidentified_directions, axis=1) > MIN_GROUP_COMPONENT
 
-    def shift(self, rows: Array) -> Array:
-        """Return the shift of x, shape (n,), by errors `rows` of the predictions, shape (known,), in units of r."""
+    def shift(self, errors: Array) -> Array:
+        """Return the shift of x, shape (n,), due to errors of the predictions, shape (known,), in units of r."""
         identified = self.directions[:, self.direction_deviations <= MAX_DIRECTION_DEVIATION]
-        return identified @ np.linalg.lstsq(self.weighted @ identified, rows, rcond=None)[0]
+        return identified @ np.linalg.lstsq(self.weighted @ identified, errors, rcond=None)[0]
 
 
 def uncertainty(
@@ -101,7 +118,7 @@ def uncertainty(
         misfit: residuals.
         solution: minimum of their cost.
         derivatives: Jacobian of the predictions by x, shape (known, n).
-        error_correlation: correlation lengths of the errors, which define K.
+        error_correlation: correlation of the errors, which defines K.
     """
     parameters = len(solution.x)
     freedom = max(1, sum(misfit.count) - parameters)
@@ -128,3 +145,122 @@ def uncertainty(
         root = independent_root @ (vectors * np.sqrt(np.maximum(values, 0.0)))
     widening = np.linalg.norm(root, axis=1) / np.linalg.norm(independent_root, axis=1)
     return Uncertainty(scales, factor, freedom, independent, residuals, weighted, singular.Vh.T, root, widening)
+
+
+class Combination(NamedTuple):
+    """Identifiable product of powers of parameters.
+
+    Attributes:
+        exponents: exponents by key.
+        standard_error: relative standard error of the product.
+    """
+
+    exponents: dict[str, float]
+    standard_error: float
+
+    def __str__(self) -> str:
+        text = ""
+        for key, exponent in sorted(self.exponents.items(), key=lambda item: item[1] < 0):
+            power = "" if abs(exponent) == 1 else f"^{abs(exponent):.3g}"
+            sign = (" / " if exponent < 0 else " x ") if text else ("1 / " if exponent < 0 else "")
+            text += f"{sign}{key}{power}"
+        return text
+
+
+class UnidentifiedGroup(NamedTuple):
+    """Parameters that are not identifiable one by one.
+
+    Attributes:
+        parameters: keys of the parameters.
+        known: identifiable combinations of them.
+        text: description, with a remedy.
+    """
+
+    parameters: list[str]
+    known: list[Combination]
+    text: str
+
+    def as_json(self) -> dict[str, Any]:
+        """Return JSON data."""
+        known = [{"combination": str(combination), **combination._asdict()} for combination in self.known]
+        return {"parameters": self.parameters, "known": known, "text": self.text}
+
+
+def unidentified_groups(
+    parameters: Sequence[Parameter], x: Array, uncertainties: Uncertainty, *, forces: bool
+) -> list[UnidentifiedGroup]:
+    """Return the groups of unidentifiable parameters.
+
+    Args:
+        parameters: parameters of the fit.
+        x: their coordinates at the solution, shape (n,).
+        uncertainties: uncertainty of the solution.
+        forces: whether forces were measured; if not, measuring them is a remedy.
+    """
+    from scipy.sparse.csgraph import connected_components
+
+    directions, members = uncertainties.unidentified_directions, np.flatnonzero(uncertainties.unidentified)
+    # The projection onto the directions couples parameters that share one; it does not depend on the basis.
+    is_coupled = np.abs(directions @ directions.T) > MIN_GROUP_COMPONENT**2
+    count, labels = connected_components(is_coupled[np.ix_(members, members)], directed=False)
+    groups = [members[labels == label] for label in range(count)]
+    pairs = zip(parameters, x.tolist(), uncertainties.deviations.tolist(), strict=True)
+    errors = np.array([parameter.relative_error(coordinate, deviation) for parameter, coordinate, deviation in pairs])
+    return [
+        _describe_group(
+            [parameters[n] for n in group],
+            float(errors[group].max()),
+            list(_known_combinations(parameters, uncertainties, group, directions[group])),
+            "" if forces else ", or give a force (--forces)",
+        )
+        for group in groups
+    ]
+
+
+def _known_combinations(
+    parameters: Sequence[Parameter], uncertainties: Uncertainty, group: Array, directions: Array
+) -> Iterator[Combination]:
+    """Yield the identifiable combinations of a group; `directions`: its rows of the unidentified directions."""
+    for exponents in _complement(directions):
+        # Exponents close to a multiple of 1/2 are rounded.
+        half = np.round(2 * exponents) / 2
+        all_exponents = np.zeros(len(parameters))
+        all_exponents[group] = np.where(np.abs(exponents - half) < 0.06, half, exponents)
+        powers = {parameters[n].key: float(all_exponents[n]) for n in group if all_exponents[n]}
+        error = float(np.linalg.norm(all_exponents @ uncertainties.root))
+        if error <= MAX_RELATIVE_ERROR:
+            yield Combination(powers, error)
+
+
+def _describe_group(
+    group: Sequence[Parameter], largest: float, known: list[Combination], remedy: str
+) -> UnidentifiedGroup:
+    """Describe a group of parameters by their largest relative error, and by the combinations that are known."""
+    keys = [parameter.key for parameter in group]
+    names = " and ".join([", ".join(keys[:-1]), keys[-1]] if len(keys) > 1 else keys)
+    fix = f"fix {'it' if len(keys) == 1 else 'them'}"
+    share = f"only to {rounded(100 * largest)} %" if largest <= MAX_RELATIVE_ERROR else ""
+    if known and not all(parameter.is_log for parameter in group):
+        return UnidentifiedGroup(keys, [], f"{names} are not identifiable one by one: fix one{remedy}")
+    if not known:
+        status = f"known {share}" if share else "not identifiable"
+        return UnidentifiedGroup(keys, [], f"{names}: {status}: {fix}")
+    combinations = ", ".join(f"{each} is known to {rounded(100 * each.standard_error)} %" for each in known)
+    return UnidentifiedGroup(keys, known, f"{combinations}, each alone {share or 'is not'}: fix one{remedy}")
+
+
+def _complement(directions: Array) -> Array:
+    """Return a basis of the orthogonal complement of directions, shape (m, directions), in reduced echelon form."""
+    vectors, singular, _ = np.linalg.svd(directions)
+    rank = int(np.sum(singular > MIN_GROUP_COMPONENT * singular[0]))
+    rows = vectors[:, rank:].T.copy()
+    # Pivots are the best identified parameters.
+    order = list(np.argsort(np.linalg.norm(directions, axis=1), kind="stable"))
+    for n in range(len(rows)):
+        pivot = max(order, key=lambda column: (abs(rows[n, column]) > 0.1, -order.index(column)))
+        order.remove(pivot)
+        rows[n] /= rows[n, pivot]
+        for row in range(len(rows)):
+            if row != n:
+                rows[row] -= rows[row, pivot] * rows[n]
+    return rows

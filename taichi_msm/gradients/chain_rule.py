@@ -1,16 +1,17 @@
 """Chain rule from the coefficients of a sheet to the numbers of its scene.
 
-Closed forms lead from the scene to a `Material`, and on to the coefficients of a time step (`derive` of every term,
-`verlet.coefficients`). They are differentiated by complex steps, exactly but for rounding: f(x + i h) is
-f(x) + i h f'(x) with an h so small that its square vanishes. Loads are linear in the percents of the load and in the
-components of the force, and control points are linear in their keyframes. The derivative with respect to one of these
-values therefore follows from the schedule with 1 for this value and 0 for all others.
+Closed forms lead from the scene to a `Material` (`derive` of every term), and on to the coefficients of a time step
+(`verlet.coefficients`). Complex steps differentiate them, exactly but for rounding: f(x + i h) is f(x) + i h f'(x) with
+an h so small that its square vanishes. Loads are linear in their percents and in the components of the force, control
+points in their keyframes. The derivative with respect to one of these values therefore follows from a schedule with 1
+for this value and 0 for all others.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
+from operator import attrgetter
 from typing import Any
 
 import numpy as np
@@ -36,9 +37,9 @@ COMPLEX_STEP = 1e-60
 
 @dataclass
 class SheetGradient:
-    """Derivatives of a loss with respect to the coefficients of a sheet, each named after its coefficient."""
+    """Derivatives of a loss with respect to the coefficients of a sheet; the comments name the coefficients."""
 
-    springs: tuple[Array, Array, Array]  # k - tau of every spring, with shapes as of `springs.spring_stiffness`
+    springs: tuple[Array, Array, Array]  # k - tau of every spring, shapes as from `springs.spring_stiffness`
     tensions: Array  # tau of springs along rows, along columns and along diagonals at constant k - tau, shape (3,)
     foundation: Array  # log K, the foundation stiffness of every mass point, shape (rows, cols)
     bending: float  # logarithm of the bending stiffness
@@ -49,7 +50,7 @@ class SheetGradient:
     first_gain: float = 0.0  # logarithm of the gain of step 0
 
     def work(self, plan: Plan) -> float:
-        """Return the derivative with respect to the logarithm of a factor that scales all internal forces."""
+        """Return p . F of internal forces F, the derivative with respect to the logarithm of their common factor."""
         factors, material = plan.material.factors, plan.material
         assert factors is not None
         total = float(self.tensions @ material.tensions) + float(self.foundation.sum()) + self.bending
@@ -68,9 +69,9 @@ class Derivatives:
         numbers: derivatives by key: material numbers other than 0, such as tissue.young; the components of a force,
             such as probes.0.total, shape (3,); the percents of a load, such as probes.0.load, shape (keyframes,); and
             across and down of a control point, such as probes.0.at, shape (2,), or (keyframes, 2) for a moving one.
-        maps: derivatives by map: with respect to the factor of every cell, `tissue.map` or `springs.map`, shape
-            (rows - 1, cols - 1); with a foundation also to that of every mass point, `tissue.foundation_map`, shape
-            (rows, cols). A scene without such a map has the factor 1 everywhere.
+        maps: derivatives by key: the stiffness factors of the cells, tissue.map or springs.map, shape (rows - 1,
+            cols - 1); and of a foundation its factors at the mass points, tissue.foundation_map, shape (rows, cols).
+            The factors are 1 in a scene without this map.
     """
 
     numbers: dict[str, float | Array]
@@ -92,15 +93,14 @@ def scene_derivatives(plan: Plan, gradient: SheetGradient, loads: LoadGradient) 
     assert material.factors is not None
     by_coefficient = _coefficient_gradient(plan, gradient)
     numbers: dict[str, float | Array] = {}
-    for path in _material_paths(plan.scene):
-        value = _value(plan.scene, path)
-        perturbed = _sheet_coefficients(plan, _with_value(plan.scene, path, value + 1j * COMPLEX_STEP))
-        numbers[".".join(path)] = float(by_coefficient @ perturbed.imag) / COMPLEX_STEP
+    for key, value in _material_numbers(plan.scene):
+        perturbed = _sheet_coefficients(plan, _with_value(plan.scene, key, value + 1j * COMPLEX_STEP))
+        numbers[key] = float(by_coefficient @ perturbed.imag) / COMPLEX_STEP
     maps = {f"{kind}.map": _gradient_by_factors(plan, gradient)}
     if kind == "tissue" and material.virtual > 0:
         factors = material.virtual_factors
         maps["tissue.foundation_map"] = gradient.foundation / (1.0 if factors is None else factors)
-    return Derivatives(numbers | loads.by_key, maps)
+    return Derivatives({**numbers, **loads.by_key}, maps)
 
 
 def _sheet_coefficients(plan: Plan, scene: Scene) -> NDArray[Any]:
@@ -117,8 +117,9 @@ def _coefficient_gradient(plan: Plan, gradient: SheetGradient) -> Array:
     material = plan.material
     assert material.factors is not None
     unit = spring_stiffness(replace(material, across=1.0, down=1.0, shear=1.0), material.factors)
-    # With respect to tau = k e at constant k; k - tau decreases with tau.
+    # The derivatives with respect to tau = k e at constant k: k - tau decreases with tau.
     tensions = gradient.tensions - [float(by_spring.sum()) for by_spring in gradient.springs]
+    # A stiffness changes the k of its springs, and their tau = k e.
     springs = [
         float((by_spring * share).sum()) + material.tension * tension
         for by_spring, share, tension in zip(gradient.springs, unit, tensions, strict=True)
@@ -154,38 +155,32 @@ def _gradient_by_factors(plan: Plan, gradient: SheetGradient) -> Array:
     return across + down + material.shear * gradient.springs[2]
 
 
-def _material_paths(scene: Scene) -> Iterator[tuple[str, ...]]:
-    """Yield the material keys that have a derivative."""
-    names = ["young", "thickness", "foundation", "pretension", "bending"]
-    dynamic: list[tuple[str, ...]] = [("tissue", "density"), ("tissue", "damping")]
-    static: list[tuple[str, ...]] = [("tissue", name) for name in names]
-    if scene.tissue is None:
-        static = [("springs", name) for name in ("structural", "shear", "virtual")]
-        dynamic = [("sheet", "mass"), ("damping",)]
-    elif isinstance(scene.tissue.foundation, Foundation):
-        law = scene.tissue.foundation
-        foundation = ["young", "depth", *(("lock", "factor") if law.lock and law.factor > 1 else ())]
-        static[2:3] = [("tissue", "foundation", name) for name in foundation]
-    # With a factor of 1 the law is linear, and has no derivative with respect to its numbers.
-    if scene.tissue is not None and scene.tissue.stiffening is not None and scene.tissue.stiffening.factor > 1:
-        static += [("tissue", "stiffening", name) for name in ("lock", "factor")]
-    for path in static if scene.time.at_rest else static + dynamic:
-        value = _value(scene, path)
+def _material_numbers(scene: Scene) -> Iterator[tuple[str, float]]:
+    """Yield the keys and values of the material numbers that have a derivative."""
+    tissue = scene.tissue
+    if tissue is None:
+        static, dynamic = ["springs.structural", "springs.shear", "springs.virtual"], ["sheet.mass", "damping"]
+    else:
+        law, foundation = tissue.foundation, ["foundation"]
+        # With a factor of 1 a law is linear, and has no derivative with respect to its numbers.
+        if isinstance(law, Foundation):
+            locks = law.lock and law.factor > 1
+            foundation = [f"foundation.{name}" for name in ("young", "depth", *(("lock", "factor") if locks else ()))]
+        stiffens = tissue.stiffening is not None and tissue.stiffening.factor > 1
+        stiffening = ["stiffening.lock", "stiffening.factor"] if stiffens else []
+        names = ["young", "thickness", *foundation, "pretension", "bending", *stiffening]
+        static, dynamic = [f"tissue.{name}" for name in names], ["tissue.density", "tissue.damping"]
+    for key in static if scene.time.at_rest else static + dynamic:
+        value = attrgetter(key)(scene)
         if value and not isinstance(value, str):
-            yield path
+            yield key, value
 
 
-def _value(section: Any, path: tuple[str, ...]) -> Any:
-    for name in path:
-        section = getattr(section, name)
-    return section
-
-
-def _with_value(section: Any, path: tuple[str, ...], value: complex) -> Any:
-    """Replace a number of a scene without validation."""
+def _with_value(section: Any, key: str, value: complex) -> Any:
+    """Return a copy of a section with another number, without validation."""
     assert isinstance(section, Section)
-    name, *inner = path
-    changed = {name: _with_value(getattr(section, name), tuple(inner), value) if inner else value}
+    name, _, inner = key.partition(".")
+    changed = {name: _with_value(getattr(section, name), inner, value) if inner else value}
     return BaseModel.model_copy(section, update=changed)
 
 
@@ -193,12 +188,12 @@ class LoadGradient:
     """Derivatives with respect to the loads, accumulated over blocks of steps.
 
     Attributes:
-        by_key: derivatives by key, as `Derivatives.numbers`.
+        by_key: derivatives by key, as in `Derivatives.numbers`.
     """
 
     def __init__(self, plan: Plan) -> None:
         self._plan = plan
-        self.by_key: dict[str, float | Array] = {}
+        self.by_key: dict[str, Array] = {}
         self._slots = {
             index: [n for n, slot in enumerate(plan.slots) if slot.probe == index]
             for index in sorted({slot.probe for slot in plan.slots})
@@ -216,29 +211,24 @@ class LoadGradient:
             schedule_of: function from a plan with other loads to the schedule of these steps.
             by_slot: derivatives with respect to the force (3) and the control point (2) of every slot, shape (steps,
                 slots, 5).
-            times: time interval of the loads of the block [s]; keyframes that do not affect it are skipped.
+            times: time interval of the block's loads [s]; only the keyframes that affect it are evaluated.
         """
         height, width = self._plan.scene.sheet.size
         for index, slots in self._slots.items():
             probe, by_force, by_point = self._plan.scene.probes[index], by_slot[:, slots, :3], by_slot[:, slots, 3:]
             unit = schedule_of(self._with_probe(index, {_force_key(probe): (1.0, 1.0, 1.0)})).strength
-            self._derivatives(index, _force_key(probe))[:] += (by_force * unit).sum(axis=(0, 1))
+            self.by_key[f"probes.{index}.{_force_key(probe)}"] += (by_force * unit).sum(axis=(0, 1))
             keys = [time for time, _ in probe.load]
             for n in _active_keys(keys, times):
                 load = tuple((time, float(m == n)) for m, time in enumerate(keys))
                 unit = schedule_of(self._with_probe(index, {"load": load})).strength
-                self._derivatives(index, "load")[n] += (by_force * unit).sum()
-            by_position = self._derivatives(index, "at").reshape(-1, 2)
+                self.by_key[f"probes.{index}.load"][n] += (by_force * unit).sum()
+            by_position = self.by_key[f"probes.{index}.at"].reshape(-1, 2)
             keys = control_points(probe, self._plan.scene.sheet)[0].tolist()
-            # The control point is constant before the first keyframe, too.
+            # Unlike the load, the control point is not 0 before the first keyframe.
             for n in _active_keys(keys, times, before=True):
                 share = schedule_of(self._with_unit_position(index, n)).point
                 by_position[n] += (by_point * share).sum(axis=(0, 1)) * (width, -height)
-
-    def _derivatives(self, index: int, name: str) -> Array:
-        derivatives = self.by_key[f"probes.{index}.{name}"]
-        assert isinstance(derivatives, np.ndarray)
-        return derivatives
 
     def _with_probe(self, index: int, changes: dict[str, Any]) -> Plan:
         """Return a plan with a changed probe, and with the slots of this probe only."""
@@ -249,7 +239,7 @@ class LoadGradient:
         return replace(self._plan, scene=changed, slots=tuple(slots[n] for n in self._slots[index]))
 
     def _with_unit_position(self, index: int, key: int) -> Plan:
-        """Return a plan with a control point at (1, 1) m in one keyframe and at 0 in all others, and the same jumps."""
+        """Return a plan with the control point of a probe at (1, 1) m in one keyframe, and at 0 in all others."""
         plan, slots = self._with_probe(index, {}), []
         for slot in plan.slots:
             ends = np.cumsum([len(segment.times) for segment in slot.segments])
@@ -268,9 +258,9 @@ def _force_key(probe: Probe) -> str:
 
 
 def _active_keys(keys: list[float], times: tuple[float, float], *, before: bool = False) -> Iterator[int]:
-    """Yield the keyframes that affect a piecewise linear function in a time interval.
+    """Yield the indices of the keyframes that affect a piecewise linear function in a time interval.
 
-    It is constant after the last keyframe, and with `before` also before the first.
+    The function is constant after the last keyframe. Before the first one it is 0, or with `before` constant.
     """
     for n in range(len(keys)):
         begin = keys[max(0, n - 1)] if n or not before else -np.inf

@@ -29,14 +29,15 @@ Array = NDArray[np.float64]
 
 
 def require_differentiable(plan: Plan) -> None:
-    """Require a scene that has a gradient.
+    """Require that a scene has a gradient.
 
     Raises:
         SceneError: when it has position-controlled tools, or another term without a gradient.
     """
     for tool in plan.tools:
-        reason = "a tool with a path has no gradient, as points meet and leave it; fit such scenes by differences"
-        raise SceneError([f"probes.{tool.probe}.path: {reason}"])
+        reason = "a tool with a path has no gradient, as its contact begins and ends"
+        remedy = "fit numbers instead of a map, or take finite differences"
+        raise SceneError([f"probes.{tool.probe}.path: {reason}; {remedy}"])
     for term in build_terms(plan):
         if not term.has_gradient:
             reason = "has no gradient, which the fit of a map needs; remove it, or fit numbers"
@@ -94,7 +95,7 @@ class Adjoint:
         Args:
             factors: stiffness factors of the cells, shape (rows - 1, cols - 1); None for those of the scene.
             pause: called several times a second; an exception from it ends the run, without derivatives.
-            scene: scene with other forces of probes in place of the plan's; None for that of the plan.
+            scene: the plan's scene with other forces of its probes; None for the plan's.
 
         Returns:
             Positions at every frame [m], shape (F + 1, rows, cols, 3).
@@ -153,13 +154,13 @@ class Adjoint:
         return replace(plan, material=material, stable_step=limit)
 
 
-# Function from the positions at every frame to the value of a loss and its derivative with respect to the positions.
+# Loss, a function of the positions at every frame. Returns its value, and its derivative in the shape of the positions.
 Loss = Callable[[Array], tuple[float, Array]]
 
 
 @dataclass(frozen=True)
 class Gradient(Derivatives):
-    """Value of a loss, and its derivatives with respect to the numbers of a scene, see `Derivatives`."""
+    """Value of a loss, and its derivatives with respect to the numbers of a scene, as in `Derivatives`."""
 
     value: float
 
@@ -174,14 +175,14 @@ def gradient(scene: Scene | Mapping[str, Any], loss: Loss, threads: int | None =
         scene: scene from `load_scene`, or a mapping of its keys.
         loss: function of the positions at every frame [m], shape (F + 1, rows, cols, 3). It returns its value and its
             derivative with respect to the positions, an array of the same shape.
-        threads: number of CPU threads; None for every core.
+        threads: number of CPU threads; None for all cores.
 
     Returns:
         The value of the loss and its derivatives.
 
     Raises:
         SceneError: when the scene cannot be run, or a tool has a path.
-        ArgumentError: when the result of the loss is not such a pair.
+        ArgumentError: when the loss does not return a number and such an array.
         DivergedError: when the simulation diverges.
         MsmError: when the stiffness of a quasi-static sheet is singular.
 

@@ -1,4 +1,4 @@
-"""Kernels of the adjoint of the time stepping: one steps forward and stores all displacements, one sweeps backward.
+"""Kernels of the adjoint of the time stepping: `store` steps forward and stores all displacements, `sweep` steps back.
 
 A step is d' = keep d + G F(u), u' = u + d', where G is the gain divided by the area share of a mass point, or 0 if it
 is fixed. Let e be the derivative of the loss with respect to d'. From the last step to the first, p = G e follows
@@ -7,10 +7,10 @@ is fixed. Let e be the derivative of the loss with respect to d'. From the last 
 
 where F' is the Jacobian of the forces, which is symmetric, and l_n the partial derivative of the loss with respect to
 u_n. These are the steps of a sheet with linearised springs, so the adjoint is swept like the sheet. A change f of the
-force of step n changes the loss by p_{n+1} . f; the sweep accumulates this product for every coefficient.
+force in step n changes the loss by p_{n+1} . f; the sweep adds up this product for every coefficient.
 
 Every worker has a band of rows, and steps it from one buffer into another as soon as its neighbours have reached the
-same step. A row is swept from left to right, cell by cell. Each spring is evaluated once, or twice between two bands,
+same step. A row is swept from left to right, cell by cell. Each spring is evaluated once; one between two bands twice,
 by both workers. Sums are stored by row, so the bits do not depend on the number of workers. A worker that waits too
 long gives up, and a single worker finishes for all (`bands`).
 """
@@ -36,11 +36,11 @@ from taichi_msm.terms.springs import ALONG_COLUMN, ALONG_ROW, DIAGONAL, SpringTe
 # WORKERS       workers
 # ROWS          rows of the sheet
 # STRIP         columns of a strip
-# U_STEP        index of the displacements at the first step; in a sweep at the last step
+# U_STEP        index of the displacements of the first step; in a sweep, of the last one
 # MOMENT_ROW    first row of the moments in the arrays
-# CARRY         first row of the carried forces, which a row adds to the next row
+# CARRY         first row of the carried forces, those of a row on the next row
 # CARRIED_ROWS  rows of carried forces per worker
-# MAX_CHECKS    times that a worker checks its neighbour before it gives up
+# MAX_CHECKS    number of times that a worker checks its neighbour before it gives up
 # BUFFER        buffer that contains p, 0 or 1
 # WITH_LOSS     1 if the last step adds the derivative of the loss, else 0
 COUNT, WORKERS, ROWS, STRIP, U_STEP, MOMENT_ROW, CARRY, CARRIED_ROWS, MAX_CHECKS, BUFFER, WITH_LOSS = range(11)
@@ -54,7 +54,7 @@ BUFFERS, ADJOINT_CHANGE, LOSS, ADJOINT_PARTS = 0, 2, 3, 4
 # Parts of the accumulated derivatives, in multiples of the sheet's rows, with respect to
 # SPRING_PARTS     k - tau of springs along rows, along columns and along diagonals, 3 parts
 # FOUNDATION_PART  log K, for an area share of 1
-# SUM_PARTS        number of these parts; `decay_gradients` of slots that do not move follow
+# SUM_PARTS        number of these parts; after them come `ProbeTerm.decay_gradients`
 SPRING_PARTS, FOUNDATION_PART, SUM_PARTS = 0, 3, 4
 
 # Indices of the sums of a row, which follow the parts:
@@ -62,9 +62,16 @@ SPRING_PARTS, FOUNDATION_PART, SUM_PARTS = 0, 3, 4
 # TENSION_SUMS          derivatives with respect to tau of each family of springs, 3 sums
 # BENDING_SUM           derivative with respect to log D
 # LOCK_SUMS             derivatives with respect to log(lock) and factor of the springs
-# FOUNDATION_LOCK_SUMS  the same of the foundation
+# FOUNDATION_LOCK_SUMS  the same for the foundation
 # ROW_SUMS              number of sums
 KEEP_SUM, TENSION_SUMS, BENDING_SUM, LOCK_SUMS, FOUNDATION_LOCK_SUMS, ROW_SUMS = 0, 1, 4, 5, 7, 9
+
+# Indices of the results of `SpringTerm.build_spring_tangent`. After the change of the force, 3, the derivatives with
+# respect to
+# BY_STIFFNESS  k - tau
+# BY_TENSION    tau
+# BY_LOCK       log(lock) and factor, only of springs that lock
+BY_STIFFNESS, BY_TENSION, BY_LOCK = 3, 4, 5
 
 # Derivatives per slot, step and row: with respect to the force, 3, and the control point, 2.
 LOAD_DERIVATIVES = 5
@@ -108,11 +115,11 @@ class LoadTables(NamedTuple):
 
 
 def _build_run_worker(step_band: Callable[..., None], *, parallel: bool) -> Callable[..., None]:
-    """Build the function that runs the steps of a launch, of one worker if parallel, else of all workers in turn."""
+    """Build the function that runs the steps of a launch: of one worker if parallel, otherwise of all in turn."""
 
     @ti.func
     def wait_for(progress: ti.template(), sizes: ti.template(), worker, k):
-        """Wait until a worker has finished k steps; return whether it did in time, true for a missing worker."""
+        """Wait until a worker has finished k steps; return whether it did so in time. A missing worker did."""
         finished = True
         if 0 <= worker < sizes[WORKERS]:
             steps, checks = ti.atomic_add(progress[STRIDE * worker], 0), 0
@@ -143,9 +150,9 @@ def _build_run_worker(step_band: Callable[..., None], *, parallel: bool) -> Call
 
 
 def _build_store_moments(code: KernelConfig) -> list[Callable[..., None]]:
-    """Return the function that stores the moments for row i of a band, in a list; empty without bending.
+    """Return a list with the function that stores the moments for row i of a band; empty without bending.
 
-    The first row of a band needs the moments of three rows, every further row those of one more.
+    The first row of a band needs the moments of three rows; each further row adds one.
     """
     bending, fill_halo = code.get(BendingTerm), build_fill_halo(code)
     if bending is None:
@@ -250,22 +257,22 @@ def _build_sweep_row(code: KernelConfig) -> Callable[..., None]:
     vector, columns, springs = code.vector, code.first_column(None), code.require(SpringTerm)
     structural, shear, tension = springs.structural, springs.shear, springs.tense
     differentiate = springs.build_spring_tangent(code)
-    *_, row_stiffness, column_stiffness, diagonal_stiffness = springs.build_spring_forces(code)
+    row_stiffness, column_stiffness, diagonal_stiffness = springs.build_stiffness(code)
     tangents = [add for term in code.terms for add in term.build_tangents(code)]
     dampings = [damp for term in code.terms for damp in term.build_damping(code)]
     probes, foundation_term = code.require(ProbeTerm), code.get(FoundationTerm)
     laplacians = [] if code.get(BendingTerm) is None else [build_laplacian(code)]
     add_load_derivatives = probes.build_load_adjoint(code, SUM_PARTS)
-    slots, standing = len(probes.moves), probes.moves.count(False)
+    slots, stationary = len(probes.moves), probes.moves.count(False)
     foundation = code.first_column(FoundationTerm) if foundation_term else 0
     foundation_derivatives = [foundation_term.build_derivatives(code)] if foundation_term else []
-    shares = [foundation_term.build_share(code)] if foundation_term and foundation_term.locks else []
+    stiffness_functions = [foundation_term.build_stiffness(code)] if foundation_term and foundation_term.locks else []
     locks = springs.law.parameter_count > 0
-    results = 7 if locks else 5
+    results = BY_LOCK + 2 if locks else BY_LOCK
 
     @ti.func
     def spring_tangent(sheet: ti.template(), offset, p, q, x0, y0, length, k, family: ti.template()):
-        """Differentiate the spring force between entries p and q of the adjoint; u is `offset` entries after p."""
+        """Differentiate the force of the spring between entries p and q, at `offset` entries further in `history`."""
         p_difference = [sheet.u[c][p] - sheet.u[c][q] for c in ti.static(range(3))]
         u_difference = [sheet.history[c][p + offset] - sheet.history[c][q + offset] for c in ti.static(range(3))]
         return differentiate(sheet, family, u_difference, p_difference, x0, y0, length, k)
@@ -277,7 +284,7 @@ def _build_sweep_row(code: KernelConfig) -> Callable[..., None]:
 
     @ti.func
     def sweep_row(sheet: ti.template(), band: ti.template(), i, loads: ti.template(), by_load: ti.template()):
-        """Sweep row i of a band; for row low - 1 compute only the forces carried to the band's first row."""
+        """Sweep row i of a band; of the row above the band, compute only the forces carried to its first row."""
         width, dx, dy, owned = sheet.width, sheet.constants[DX], sheet.constants[DY], i >= band.low
         diagonal, kind = ti.sqrt(dx * dx + dy * dy), ti.select(i == sheet.rows - 1, 2, ti.select(i == 0, 0, 1))
         entry_row, below = (band.source + i) * width, (band.source + ti.min(i + 1, sheet.rows - 1)) * width
@@ -329,7 +336,7 @@ def _build_sweep_row(code: KernelConfig) -> Callable[..., None]:
                         add_change(force, sheet, entry, now)
                     gain = now[GAIN] * sheet.by_column[(MOBILITY + kind) * width + b]
                     q = [sheet.u[c][(ADJOINT_CHANGE * sheet.rows + i) * width + b] for c in ti.static(range(3))]
-                    # Summed over all n, p_{n+1} (u_n - u_{n-1}) equals u_n q_{n+1} but for rounding.
+                    # By summation by parts over all n, p_{n+1} (u_n - u_{n-1}) equals q_{n+1} u_n but for rounding.
                     keep_sum = q[0] * u[0] + q[1] * u[1] + q[2] * u[2]
                     for damp in ti.static(dampings):
                         damp(q, sheet)
@@ -342,27 +349,29 @@ def _build_sweep_row(code: KernelConfig) -> Callable[..., None]:
                         sheet.u[c][(band.target + i) * width + b] = p[c] + q[c]
                     # A spring pulls its ends in opposite directions.
                     if ti.static(structural):
-                        add(sheet.derivatives, (ALONG_ROW * sheet.rows + i) * width + b, right[3] * (-1.0))
-                        add(sheet.derivatives, (ALONG_COLUMN * sheet.rows + i) * width + b, down[3] * (-1.0))
+                        add(sheet.derivatives, (ALONG_ROW * sheet.rows + i) * width + b, right[BY_STIFFNESS] * (-1.0))
+                        add(sheet.derivatives, (ALONG_COLUMN * sheet.rows + i) * width + b, down[BY_STIFFNESS] * (-1.0))
                     if ti.static(shear):
-                        diagonals = falling[3] + rising[3]
+                        diagonals = falling[BY_STIFFNESS] + rising[BY_STIFFNESS]
                         add(sheet.derivatives, (DIAGONAL * sheet.rows + i) * width + b, diagonals * (-1.0))
                     for derive in ti.static(foundation_derivatives):
                         index, by_foundation = (FOUNDATION_PART * sheet.rows + i) * width + b, derive(sheet, p, u)
                         add(sheet.derivatives, index, by_foundation[0] * (0 - now[foundation]))
-                        for share in ti.static(shares):
-                            k = share(sheet, entry, now[foundation])
+                        for stiffness_at in ti.static(stiffness_functions):
+                            k = stiffness_at(sheet, entry, now[foundation])
                             for n in ti.static(range(2)):
                                 at_sum = ti.static(FOUNDATION_LOCK_SUMS + n)
                                 sums[at_sum] = sums[at_sum] - k * by_foundation[1 + n]
                     if ti.static(locks):
                         for n in ti.static(range(2)):
-                            springs_here = (right[5 + n] + down[5 + n]) + (falling[5 + n] + rising[5 + n])
-                            sums[LOCK_SUMS + n] = sums[LOCK_SUMS + n] - springs_here
+                            by_lock = ti.static(BY_LOCK + n)
+                            of_springs = (right[by_lock] + down[by_lock]) + (falling[by_lock] + rising[by_lock])
+                            sums[LOCK_SUMS + n] = sums[LOCK_SUMS + n] - of_springs
                     if ti.static(tension):
-                        sums[TENSION_SUMS + ALONG_ROW] = sums[TENSION_SUMS + ALONG_ROW] - right[4]
-                        sums[TENSION_SUMS + ALONG_COLUMN] = sums[TENSION_SUMS + ALONG_COLUMN] - down[4]
-                        sums[TENSION_SUMS + DIAGONAL] = sums[TENSION_SUMS + DIAGONAL] - (falling[4] + rising[4])
+                        sums[TENSION_SUMS + ALONG_ROW] = sums[TENSION_SUMS + ALONG_ROW] - right[BY_TENSION]
+                        sums[TENSION_SUMS + ALONG_COLUMN] = sums[TENSION_SUMS + ALONG_COLUMN] - down[BY_TENSION]
+                        of_diagonals = falling[BY_TENSION] + rising[BY_TENSION]
+                        sums[TENSION_SUMS + DIAGONAL] = sums[TENSION_SUMS + DIAGONAL] - of_diagonals
                     if ti.static(code.by_area):
                         keep_sum *= sheet.by_column[(AREA_SHARE + kind) * width + b]
                     sums[KEEP_SUM] += keep_sum
@@ -381,7 +390,7 @@ def _build_sweep_row(code: KernelConfig) -> Callable[..., None]:
                 to_next[c] = right[c] - rising[c]
                 to_below[c] = falling[c]
         if owned:
-            first = (SUM_PARTS + 2 * standing) * sheet.rows * width + ROW_SUMS * i
+            first = (SUM_PARTS + 2 * stationary) * sheet.rows * width + ROW_SUMS * i
             for n in ti.static(range(ROW_SUMS)):
                 add(sheet.derivatives, first + n, sums[n])
             for n in ti.static(range(LOAD_DERIVATIVES * slots)):

@@ -1,8 +1,8 @@
 """Adjoint of the time stepping, with checkpoints.
 
-The forward run stores a checkpoint at the beginning of every segment; N steps have about sqrt(N / 2) segments, or fewer
-if the sheet is small. Then, backward in time, each segment runs again and stores the displacements of all its steps,
-and the adjoint is swept over them (`kernel_motion`).
+The forward run stores a checkpoint at the beginning of every segment. N steps have about sqrt(N / 2) segments, a small
+sheet fewer. Then, from the last segment to the first, each one runs again and stores the displacements of all its
+steps, and the adjoint is swept over them (`kernel_motion`).
 """
 
 from __future__ import annotations
@@ -37,18 +37,18 @@ from taichi_msm.terms.loads import ProbeTerm
 # Memory of a segment's displacements up to which segments are lengthened, to save launches [bytes].
 SEGMENT_BYTES = 64 * 2**20
 
-# Number of times that a worker checks its neighbour before it gives up; larger than in the forward run, because a
-# single worker then finishes the launch, and its kernel may have to be compiled first.
+# Number of times that a worker checks its neighbour before it gives up. It is larger than in the forward run, because
+# giving up is more expensive: the kernel of the single worker that finishes the launch may not be compiled yet.
 MAX_WAIT_CHECKS = 8 * MAX_CHECKS
 
 Array = NDArray[np.float64]
 
 
 def _segment_steps(steps: int, step_bytes: int) -> int:
-    """Return the number of steps of a segment.
+    """Return the number of steps of a segment, for the displacements of a step of `step_bytes`.
 
-    The memory of its displacements at least equals that of all checkpoints. A checkpoint has twice the size of the
-    displacements of a step, `step_bytes`.
+    The memory of a segment and of all checkpoints, 2 `step_bytes` each, has the smallest sum where both are equal. A
+    longer segment saves launches.
     """
     return min(steps, max(math.ceil(math.sqrt(2 * steps)), SEGMENT_BYTES // step_bytes))
 
@@ -92,7 +92,7 @@ class MotionAdjoint:
 
     @property
     def _decay_parts(self) -> int:
-        """Number of parts of `_derivatives` that hold `decay_gradients`, two per slot that does not move."""
+        """Number of parts of `_derivatives` with `ProbeTerm.decay_gradients`, two per slot that does not move."""
         return 2 * self.layout.config.require(ProbeTerm).moves.count(False)
 
     def _allocate(self) -> None:
@@ -113,7 +113,7 @@ class MotionAdjoint:
 
         checkpoint_rows = -(-plan.grid.steps // self._segment) * layout.rows
         self._memory = memory
-        # Displacements u and differences d at the beginning of every segment, each a list of arrays for x, y and z.
+        # Displacements u and differences d at the beginning of every segment, three arrays each for x, y and z.
         self._checkpoints, self._checkpoint_differences = vector(checkpoint_rows), vector(checkpoint_rows)
         # Displacements at every step of a segment, and differences at its current step.
         self._history = vector(self._segment * layout.rows + self._worker_rows)
@@ -205,7 +205,8 @@ class MotionAdjoint:
             return np.zeros(2)
         loads.add(lambda plan: average_loads(plan, first, end - first), by_slot, (first * h - h, end * h))
         work = (by_slot[..., :3] * average_loads(self.plan, first, end - first).strength).sum(axis=(1, 2))
-        return np.array([work[int(first == 0) :].sum(), work[: int(first == 0)].sum()])
+        first_steps = 1 if first == 0 else 0
+        return np.array([work[first_steps:].sum(), work[:first_steps].sum()])
 
     def _store_checkpoint(self, segment: int) -> None:
         sheet, first = self._forward.kernel.arrays, segment * self._step_entries
@@ -214,6 +215,7 @@ class MotionAdjoint:
 
     @property
     def _step_entries(self) -> int:
+        """Number of entries of an array per step."""
         return self.layout.rows * self.layout.width
 
     def _copy_step(self, from_entry: int, to_entry: int, source: list[Any], target: list[Any]) -> None:
@@ -246,16 +248,18 @@ class MotionAdjoint:
         return max(first, frame, end - self._max_launch_steps())
 
     def _sweep(self, first: int, end: int, by_frame: Array, table: Array) -> Array:
-        """Sweep backward from step `end` of the segment that begins at `first`, over the steps of a table of loads.
+        """Sweep backward from step `end` over the steps of a table of loads, within the segment that begins at `first`.
 
         Returns:
             Derivatives with respect to the loads, shape (steps, slots, 5).
         """
         layout, grid, count = self.layout, self.plan.grid, len(table)
         frame, steps_after_frame = divmod(end - count, grid.steps_per_frame)
-        if not steps_after_frame:
+        with_loss = steps_after_frame == 0
+        if with_loss:
             self._write_loss(by_frame[frame])
-        sizes = self._sizes(count, end - first - 1, kernels.ADJOINT_PARTS * layout.rows, not steps_after_frame)
+        moment_row = kernels.ADJOINT_PARTS * layout.rows
+        sizes = self._sizes(count, end - first - 1, moment_row, buffer=self._buffer, with_loss=with_loss)
         columns = kernels.LOAD_DERIVATIVES * len(self.plan.slots)
         by_row = np.zeros((count, layout.rows, max(1, columns)))
         self._launch(
@@ -272,11 +276,13 @@ class MotionAdjoint:
         return by_row[..., :columns].sum(axis=1).reshape(count, -1, kernels.LOAD_DERIVATIVES)
 
     def _write_loss(self, by_displacement: Array) -> None:
+        """Write the derivative of the loss with respect to the displacements of a frame to the adjoint's arrays."""
         for c in range(3):
             write_vectors(self._loss[c], to_lanes(self.layout, by_displacement[..., c]))
         self._copy_step(0, kernels.LOSS * self._step_entries, self._loss, self._adjoint)
 
     def _sheet_gradient(self, gain: float, work: Array) -> SheetGradient:
+        """Collect the accumulated derivatives; `work` is the sum of `_sweep_block` over all blocks."""
         layout = self.layout
         rows, cols, derivatives = layout.rows, layout.cols, self._derivatives.to_numpy()
         parts = from_lanes(layout, derivatives, kernels.SUM_PARTS * rows).reshape(kernels.SUM_PARTS, rows, cols)
@@ -302,15 +308,18 @@ class MotionAdjoint:
         return arrays.constants, arrays.by_column, arrays.stiffness, arrays.fields
 
     def _max_launch_steps(self) -> int:
-        # Steps times mass points of about 0.1 s on one core.
+        # 10 million steps of a mass point take about 0.1 s on one core.
         return max(1, 10_000_000 // (self.layout.rows * self.layout.cols))
 
-    def _sizes(self, count: int, u_step: int, moment_row: int, with_loss: bool = False) -> NDArray[np.int64]:
+    def _sizes(
+        self, count: int, u_step: int, moment_row: int, *, buffer: int = 0, with_loss: bool = False
+    ) -> NDArray[np.int64]:
+        """Return the sizes of a launch in the order of `kernel_motion`, from COUNT on."""
         layout = self.layout
         carry = moment_row + MOMENT_ROWS * layout.workers
         return np.array([
             count, layout.workers, layout.rows, layout.strip, u_step, moment_row, carry, self._carried_rows,
-            MAX_WAIT_CHECKS, self._buffer if moment_row == kernels.ADJOINT_PARTS * layout.rows else 0, with_loss,
+            MAX_WAIT_CHECKS, buffer, with_loss,
         ])  # fmt: skip
 
     def _launch(self, build: Callable[..., Callable[..., None]], sizes: NDArray[np.int64], *arguments: Any) -> None:

@@ -1,7 +1,7 @@
 """Adjoint of the quasi-static equilibrium: one linear solution per frame.
 
-At equilibrium F(u) = 0. A change f of the forces changes u by K^-1 f, with the tangent stiffness K = -F'(u), and the
-loss by p . f. The adjoint p solves K p = l, where l is the derivative of the loss with respect to u.
+At equilibrium F(u) = 0. A change f of the forces changes u by K^-1 f, with the tangent stiffness K = -F'(u). It changes
+the loss by p . f, where the adjoint p solves K p = l, and l is the derivative of the loss with respect to u.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ if TYPE_CHECKING:
 
 Array = NDArray[np.float64]
 
-# Largest residual of a linear solution, relative to the right-hand side; a larger one means a singular stiffness.
+# Largest residual of a linear solution, relative to the right-hand side. Above it, the stiffness counts as singular.
 RESIDUAL_TOLERANCE = 1e-6
 
 
@@ -103,13 +103,13 @@ class RestAdjoint:
             foundation = plan.material.virtual * at_frame.active[0] * point_shares(plan)
             stiffness = _stiffness(plan, families, foundation, laplacian, u)
             p = _run_interruptibly(partial(_solve, plan, stiffness, by_displacement), pause)
-            if p is None and u.any():
+            if p is None:
+                if not u.any():
+                    continue  # A flat sheet remains flat with any material.
                 raise MsmError(
                     f"frame {n} has no gradient: the sheet has no stiffness against some motion; give it a foundation, "
                     "pretension or bending"
                 )
-            if p is None:
-                continue  # A flat sheet remains flat with any material.
             _add_springs(gradient, families, u, p)
             gradient.foundation_stiffening += [
                 float((by_number * p[..., 2]).sum())
@@ -135,7 +135,7 @@ class RestAdjoint:
 
 
 def _add_springs(gradient: SheetGradient, families: Sequence[SpringFamily], u: Array, p: Array) -> None:
-    """Add the derivatives with respect to the numbers of the springs, for an adjoint p at displacements u."""
+    """Add the derivatives with respect to the coefficients of the springs, for the adjoint p at displacements u."""
     for n, family in enumerate(families):
         q, edges, square_difference, square = family.elongation(u)
         p_difference = p[family.start] - p[family.end]
@@ -185,7 +185,7 @@ def _laplacian(plan: Plan) -> Any:
 
 
 def _run_interruptibly(work: Callable[[], Array | None], pause: Pause) -> Array | None:
-    """Run a function in a thread and call `pause` meanwhile; an exception from `pause` abandons the thread."""
+    """Run a function in a thread, and call `pause` meanwhile; an exception from `pause` leaves the thread behind."""
     future: Future[Array | None] = Future()
 
     def finish() -> None:

@@ -1,4 +1,4 @@
-"""Dual numbers: values with their derivatives along x and y, for the Jacobian of a lens."""
+"""Dual numbers: values and their derivatives along x and y, for the Jacobian of a lens."""
 
 from __future__ import annotations
 

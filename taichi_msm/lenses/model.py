@@ -1,8 +1,8 @@
 """Interface of a lens model.
 
-A lens maps normalised image coordinates to distorted ones. The coordinates (x, y) are those of a line of sight in the
-plane at depth 1, x right and y down as in OpenCV. The formula is plain arithmetic: NumPy calls it unchanged, kernels
-call it wrapped by Taichi, and dual numbers yield its Jacobian.
+A lens distorts normalised image coordinates: the coordinates (x, y) of a line of sight in the plane at depth 1, x right
+and y down as in OpenCV. The formula is plain arithmetic: NumPy calls it unchanged, kernels call it wrapped by Taichi,
+and dual numbers yield its Jacobian.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ class Operations(NamedTuple):
     sqrt: Callable[..., Any]
     arctan: Callable[..., Any]
     maximum: Callable[..., Any]
-    wrap: Callable[[Callable[..., Any]], Callable[..., Any]]  # makes a Python function callable from the formula
+    wrap: Callable[[Callable[..., Any]], Callable[..., Any]]  # from a Python function to one that the formula can call
 
 
 NUMPY = Operations(np.sqrt, np.arctan, np.maximum, lambda function: function)
@@ -58,21 +58,21 @@ class LensModel(ABC):
 
     @abstractmethod
     def build(self, operations: Operations) -> Callable[..., Any]:
-        """Build the formula distort(x, y, *coefficients), which returns the distorted x and y."""
+        """Return the formula distort(x, y, *coefficients), whose results are the distorted x and y."""
 
     @abstractmethod
     def limit(self, coefficients: Sequence[float]) -> float:
-        """Return the valid radius: up to the first fold or pole of the distortion, at most `MAX_RADIUS`."""
+        """Return the valid radius: that of the first fold or pole of the distortion, at most `MAX_RADIUS`."""
 
     def undistort(self, distorted: Array, coefficients: Sequence[float]) -> Array | None:
-        """Invert the formula in closed form; return None for a model without one.
+        """Invert the formula in closed form.
 
         Args:
             distorted: distorted normalised image coordinates, shape (..., 2).
             coefficients: all coefficients, in the order of the model.
 
         Returns:
-            Undistorted coordinates, shape (..., 2), NaN beyond the limit; None if Newton's method is necessary.
+            Undistorted coordinates, shape (..., 2), NaN beyond the limit; None for a model without a closed form.
         """
         return None
 

@@ -1,8 +1,8 @@
 """OpenCV's omnidirectional model, after Mei.
 
-The line of sight is projected onto the unit sphere, then, from a point at distance xi from its centre, onto a plane,
+The line of sight is projected onto the unit sphere, then, from a point at distance xi from its centre, onto a plane:
 
-    (u, v) = (x, y) / (1 + xi sqrt(1 + x^2 + y^2)),
+    (u, v) = (x, y) / (1 + xi sqrt(1 + x^2 + y^2)).
 
 The rational model with k1, k2, p1 and p2 distorts (u, v).
 

@@ -82,7 +82,7 @@ def _min_determinant(coefficients: Sequence[float], r: Any) -> Any:
         g R - 4 a^2 + 2 a (g + 3 R) c + 16 a^2 c^2,
 
     where c is the cosine of the angle between the point and (p2, p1). The Jacobian is symmetric, and on the axis the
-    identity: the lens does not fold within a radius up to which the minimum is positive.
+    identity, so the lens does not fold within the radius of the first zero.
     """
     r = np.maximum(r, 1e-8)  # a > 0, for the division
     numerator, denominator = _factors(coefficients)

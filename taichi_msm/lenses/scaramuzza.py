@@ -1,8 +1,9 @@
 """Scaramuzza's polynomial model of wide lenses, as OCamCalib, MATLAB's fisheyeIntrinsics and C3VD calibrate it.
 
-A point (u, v) of the sensor [px] at distance p from the axis has the line of sight (u, v, f) and the pixel
+A point (u, v) of the sensor [px] at distance p from the axis has the line of sight (u, v, f) and, relative to the
+principal point, the pixel (c u + d v, e u + v), with
 
-    (c u + d v, e u + v) from the principal point,    f(p) = a0 + a2 p^2 + a3 p^3 + a4 p^4.
+    f(p) = a0 + a2 p^2 + a3 p^3 + a4 p^4.
 
 With r = |(x, y)|, p solves p = r f(p). In units of the focal length a0: t = p / a0, g(t) = f(p) / a0.
 
@@ -43,12 +44,12 @@ class Scaramuzza(LensModel):
         def distort(x, y, a0, a2, a3, a4, c, d, e):
             b2, b3, b4 = a0 * a2, a0 * a0 * a3, a0 * a0 * a0 * a4
             r = sqrt(maximum(x * x + y * y, MIN_SQUARED_RADIUS))
-            # Start at the solution for a3 = a4 = 0, or that of a stereographic lens if smaller.
+            # Start at the solution for a3 = a4 = 0, or at that of a stereographic lens if it is smaller.
             t = 2.0 * r / (1.0 + sqrt(1.0 + maximum(b2 * (-4.0), 1.0) * r * r))
             # Lenses of endoscopes need 3 steps, lenses that fold back 5.
             for _ in range(5):
-                # Go to the nearer root of the osculating parabola of h = t - r g, as Newton's method is slow near a
-                # fold. At the fold the discriminant is 0; the limit of the lens is just below it.
+                # Go to the nearer root of the osculating parabola of h = t - r g; near a fold, Newton's method is slow.
+                # The discriminant is 0 at the fold, and the limit of the lens just below it.
                 h = t - r * (1.0 + t * t * (b2 + t * (b3 + t * b4)))
                 slope = 1.0 - r * t * (2.0 * b2 + t * (3.0 * b3 + t * (4.0 * b4)))
                 curvature = r * (2.0 * b2 + t * (6.0 * b3 + t * (12.0 * b4)))
@@ -81,7 +82,7 @@ class Scaramuzza(LensModel):
         radii = radial_positions / g(radial_positions)
         with np.errstate(all="ignore"):
             roots, _ = self.build(NUMPY)(radii, 0.0, a0, a2, a3, a4, 1.0, 0.0, 0.0)
-        # The tolerance is 1e-6 px at a focal length of 1000 px.
+        # 1e-9 is 1e-6 px at a focal length of 1000 px.
         is_wrong = ~(np.abs(roots - radial_positions) <= 1e-9)
         if is_wrong.any():
             return float(radii[max(0, np.argmax(is_wrong) - 1)])

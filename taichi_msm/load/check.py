@@ -33,7 +33,7 @@ _REPLACEMENTS: dict[str, Any] = {
 
 
 def validate(data: dict[str, Any]) -> tuple[Plan | None, list[Problem]]:
-    """Validate the keys of a scene separately, then combinations of keys; return the plan or None, and all problems.
+    """Return the plan of a scene, None if it is invalid, and all problems of its keys and of their combinations.
 
     Faulty sections are replaced by valid ones before combinations are checked, so that all problems come at once.
     """
@@ -45,7 +45,7 @@ def validate(data: dict[str, Any]) -> tuple[Plan | None, list[Problem]]:
         problems += new_problems
         if scene is not None:
             plan, new_problems = _check_combinations(scene)
-            # Ignored: the speed of tools after a replacement of sections that determine the step.
+            # If a section that determines the step was replaced, problems of the tools' speed are meaningless.
             replaced = {problem.path[0] for problem in problems} & {"sheet", "tissue", "springs", "time"}
             problems += [
                 _with_file(problem, data) for problem in new_problems if not (replaced and "path" in problem.path)

@@ -108,7 +108,7 @@ def estimate_budget(plan: Plan) -> Budget:
     position_bytes = frames * points * 3 * number_bytes
     track_bytes = scene.render.tracks**2 * (frames * TRACK_BYTES + 16) + FILE_BYTES if "tracks" in scene.output else 0
     track_bytes *= cameras
-    force_rows = frames * len(scene.probes) if "forces" in scene.output else 0
+    force_rows = frames * len(scene.probes)
     memory_numbers = len(memory_names(plan))
     numbers = STATE_NUMBERS + OUTPUT_NUMBERS + memory_numbers + sum(MAP_NUMBERS[name] for name in scene.maps)
     numbers += sum(not probe.moved for probe in scene.probes)  # the load of each force-controlled tool
@@ -128,8 +128,7 @@ def estimate_budget(plan: Plan) -> Budget:
         record_bytes=2 * len(scene.model_dump_json(indent=2)) + RECORD_BYTES,
         # Two states (the saved one and its replacement), and the positions and forces of all frames.
         working_bytes=2 * points * (STATE_NUMBERS + memory_numbers) * number_bytes
-        + (position_bytes if scene.output else 0)
-        + force_rows * FORCE_BYTES,
+        + (position_bytes + force_rows * FORCE_BYTES if scene.output else 0),
     )
 
 
@@ -230,7 +229,7 @@ class DurationEstimate(NamedTuple):
     """Estimated duration of a run [s]."""
 
     seconds: float
-    start: float  # share before the first step [s], included in `seconds`
+    start: float  # time before the first step [s], included in `seconds`
 
 
 def estimate_duration(plan: Plan) -> DurationEstimate:

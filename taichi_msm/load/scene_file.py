@@ -246,10 +246,10 @@ class Draft:
     def resolve_path(self, key: Key, folder: Path) -> None:
         """Rewrite a path in the file to be relative to the current directory.
 
-        Recorded as problems: a path outside the folder, except from an override, and a missing camera file.
+        A path outside the folder, unless from an override, and a missing camera file are recorded as problems.
 
         Args:
-            key: key of the path; values other than a text are ignored, for validation.
+            key: key of the path; a value other than a text is left to validation.
             folder: folder of the scene file, to which the path is relative.
         """
         section, path = value_at(self.data, key[:-1]), value_at(self.data, key)

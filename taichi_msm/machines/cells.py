@@ -140,7 +140,7 @@ def read_text(name: str, is_header: Callable[[Row], bool], expected: str) -> Gri
 
     Args:
         name: path of the file.
-        is_header: whether a split row is a header; selects the separator.
+        is_header: whether a row is a header; the separator is one that splits a line into a header.
         expected: description of a readable file, for messages.
 
     Raises:
@@ -151,7 +151,7 @@ def read_text(name: str, is_header: Callable[[Row], bool], expected: str) -> Gri
     for n, line in enumerate(lines):
         headers = {}
         if LETTER.search(line):
-            headers = {mark: row for mark in SEPARATORS if is_header(row := _split_header(line, mark))}
+            headers = {key: row for key in SEPARATORS if is_header(row := _split_header(line, key))}
         if headers:
             separator = _choose_separator(headers, lines[n + 1 :])
         cells = headers[separator] if headers else _split_line(line, separator)
@@ -250,13 +250,12 @@ def _strip(cells: Row) -> Row:
 
 
 def _choose_separator(headers: dict[str, Row], lines: list[str]) -> str:
-    """Return the first separator that splits the next line of numbers into three or more, or else the first."""
+    """Return the first separator that splits the next line of numbers into at least three; otherwise the first key."""
     line = next((line for line in lines if line.strip() and not LETTER.search(line)), "")
 
     def count(separator: str) -> int:
-        return sum(
-            parse_number(cell) is not None for cell in _split_stripped(line, separator)[: len(headers[separator])]
-        )
+        cells = _strip(_split_line(line, separator))[: len(headers[separator])]
+        return sum(parse_number(cell) is not None for cell in cells)
 
     return next((separator for separator in headers if count(separator) >= 3), next(iter(headers)))
 
@@ -265,16 +264,11 @@ def _split_header(line: str, separator: str) -> Row:
     """Split a line that may be a header."""
     if spaces := SPACES.get(separator):
         return _strip(spaces.split(line.replace('"', "").strip("#% \t")))
-    return _split_stripped(line, separator)
-
-
-def _split_stripped(line: str, separator: str) -> Row:
-    """Split a line of text, without empty cells at the end."""
     return _strip(_split_line(line, separator))
 
 
 def _split_line(line: str, separator: str) -> Row:
-    """Split a line, with empty cells at the end; without a separator, before the first header, it is one cell."""
+    """Split a line, with empty cells at the end; before the first header, without a separator, a line is one cell."""
     if separator in SPACES:
         return line.replace('"', "").split()
     if separator:

@@ -135,11 +135,6 @@ class Loading:
     contact: float
 
     @property
-    def scene_time(self) -> Array:
-        """Times of the frames in the scene [s], shape (frames,)."""
-        return np.arange(len(self.depth)) / self.rate
-
-    @property
     def peak(self) -> float:
         """Largest measured force of a frame [N]."""
         return float(self.force.max())
@@ -165,7 +160,8 @@ def build_loading(
     Args:
         test: the test.
         scene: scene of the tool and the tissue.
-        rate: frames per second; by default at most 10, or equidistant in depth for equilibria without relaxation.
+        rate: frames per second; by default 10, or fewer for a long test; of equilibria without relaxation, frames are
+            then equidistant in depth.
         contact: depth of contact, as in the table [m]; by default estimated from the forces, for a clamp the first
             depth.
         is_clamp: whether the tool is a clamp.
@@ -217,9 +213,9 @@ def _contact_row(test: MachineTest, noise: float, peak: int) -> int:
 
 
 def late_contact_note(loading: Loading, key: str) -> str | None:
-    """Return a warning about a contact that is estimated too late, or None.
+    """Return a warning if the force rises already in the first rows, or None.
 
-    The force then rises already in the first rows, and their noise is estimated too large.
+    The noise of these rows is then too large, and the contact is found too late.
 
     Args:
         loading: the test.
@@ -254,9 +250,9 @@ def _sample_in_depth(test: MachineTest, noise: float, contact: float) -> Loading
 
 
 def _means(coordinate: Array, at: Array, half_width: float, columns: Sequence[Array]) -> list[Array]:
-    """Average columns around the coordinates `at`, shape (n,), over the rows within `half_width`.
+    """Return columns at coordinates `at`, shape (n,): means over the rows within `half_width`, else interpolated.
 
-    Columns are interpolated where there are none. `coordinate`, shape (rows,), increases.
+    `coordinate`, shape (rows,), is the position of a row, and increases.
     """
     # Rows on the border of two frames belong to both, up to rounding.
     reach = half_width * (1 + 1e-6)

@@ -120,7 +120,7 @@ def read_machine_test(
         grid = read_text(name, lambda row: _is_header(row, chosen), EXPECTED)
     else:
         raise SceneError([f"--sheet {sheet}: {name} is a text, without sheets; leave the option out"])
-    # Without a block of enough rows, a shorter one gets an error about them.
+    # A block of too few rows counts only if there is no other; `_read_block` then raises the error.
     blocks = _find_blocks(grid, chosen) or _find_blocks(grid, chosen, min_rows=0)
     if not blocks:
         raise SceneError([_missing_header(grid, chosen)])
@@ -206,19 +206,21 @@ def _choose_sheet(name: str, sheets: dict[str, Grid], chosen: str | None, tables
 
 
 def _find_blocks(grid: Grid, chosen: dict[str, str], min_rows: int = MIN_ROWS) -> list[_Block]:
-    """Find the blocks with at least `min_rows` rows of numbers, which excludes summaries."""
+    """Find the blocks with at least `min_rows` rows of numbers; shorter ones are summaries."""
     headers = [n for n, row in enumerate(grid.rows) if _is_header(row, chosen)]
     blocks = []
     for header, end in pairwise([*headers, len(grid.rows)]):
         rows = [n for n in range(header + 1, end) if grid.has_content(n)]
         candidates = _find_candidates(grid.rows[header], chosen)
-        has_units = bool(rows) and any(
-            index < len(grid.rows[rows[0]]) and _unit_factor(quantity, grid.rows[rows[0]][index]) is not None
+        first = grid.rows[rows[0]] if rows else []
+        has_units = any(
+            index < len(first) and _unit_factor(quantity, first[index]) is not None
             for quantity, columns in candidates.items()
             for index in columns
         )
         units, rows = (rows[0], rows[1:]) if has_units else (None, rows)
-        if sum(sum(parse_number(cell) is not None for cell in grid.rows[n]) >= len(WORDS) for n in rows) >= min_rows:
+        counts = [sum(parse_number(cell) is not None for cell in grid.rows[n]) for n in rows]
+        if sum(count >= len(WORDS) for count in counts) >= min_rows:
             blocks.append(_Block(header, units, rows, end))
     return blocks
 
@@ -235,6 +237,7 @@ def _find_candidates(row: Row, chosen: dict[str, str]) -> dict[str, list[int]]:
     """Return the candidate columns of every quantity."""
     candidates = {}
     for quantity, title in chosen.items():
+        # Columns of the whole title, or else of its name without the unit.
         name = _fold(_split_choice(title, quantity)[0])
         same = [n for n, cell in enumerate(row) if _fold(cell) == _fold(title)]
         candidates[quantity] = same or [
@@ -387,7 +390,7 @@ def _rows_of_numbers(grid: Grid, block: _Block, columns: list[_Column]) -> Itera
         is_complete = len(cells) == len(indices)
         if is_complete and not any(cells):
             continue
-        # Text may contain numbers, so that only the time, or the first cell, of a short row decides.
+        # A row of text may contain numbers: of a short row only the time decides, or else the first cell.
         if not any(map(VALUE_START.match, cells if is_complete else row[indices[0] :][:1] or row[:1])):
             text = n if text is None else text
         elif text is None:

@@ -177,7 +177,9 @@ def describe_forces(record: ProbeRecord) -> str:
     if "total_force" not in record:
         known = "greatest_force" in record
         return f"at most {record['greatest_force']:.3g} N, at {record['greatest_force_time']:.3g} s" if known else ""
-    flat = f", {record['flat_end_force']:.3g} N of it under the flat end" if record["flat_end_force"] > 0 else ""
+    # On a sheet that is smaller than the tool, only a part of these forces acts.
+    has_flat_end = 0 < record["flat_end_force"] <= record["total_force"]
+    flat = f", {record['flat_end_force']:.3g} N of it under the flat end" if has_flat_end else ""
     return f"{record['total_force']:.3g} N in all{flat}, at most {record['largest_pressure'] / 1000:.3g} kPa"
 
 

@@ -223,8 +223,10 @@ def path_problems(scene: Scene, tools: Sequence[Tool], grid: TimeGrid) -> Iterat
             continue
         depth = -gap_to_sheet(tool, scene.sheet)
         if depth > 1e-9 * tool.radius:
-            text = f"the instrument is {depth:.3g} m in the sheet at rest at 0 s; begin above it, at a greater height"
-            yield Problem(key, text)
+            remedy = "begin above it, at a greater height"
+            if tool.axis[2] < 0:
+                remedy = "its shaft points down; take the direction from the tip to the handle"
+            yield Problem(key, f"the instrument is {depth:.3g} m in the sheet at rest at 0 s; {remedy}")
         if problem := friction_problem(tool, at_rest=scene.time.at_rest):
             yield Problem(("probes", tool.probe, "friction"), problem)
         if not scene.time.at_rest and (fault := speed_problem(tool, grid)):

@@ -1,4 +1,7 @@
-"""Spatial bins: squares of the picture, each with a list of the cells whose bounding box overlaps it."""
+"""Spatial bins: squares of the picture, each with a list of the cells whose bounding box overlaps it.
+
+For gpu.py, the cells are parts of cells.
+"""
 
 from typing import Any, NamedTuple
 
@@ -9,11 +12,11 @@ from taichi_msm.render.config import Integers
 from taichi_msm.system.launches import Launches, end_thread
 from taichi_msm.system.runtime import compilation_options, ti
 
-# Offsets in the bounding box of a cell: its first and last column and row, clipped to the picture. For an invisible
-# cell, the last column or row is before the first one.
+# Layout of `bounds`: for every cell the first and last column and row, clipped to the picture; if the cell is
+# invisible, the last column or row is before the first.
 FIRST_X, FIRST_Y, LAST_X, LAST_Y, BOUNDS_STRIDE = range(5)
 
-# Limit of coordinates, so that they fit into an integer.
+# Limit of the coordinates, which fit into integers.
 MAX_BOUND = 1e6
 
 # Maximum number of entries of all lists, divided by the number of cells and bins together.
@@ -41,38 +44,27 @@ def build_bins(launches: Launches, bounds: Any, cells: int, extent: tuple[int, i
         bounds: bounding boxes as stored by `store_bounds`, on the device, shape (cells * BOUNDS_STRIDE,).
         cells: number of cells.
         extent: width and height of the picture, in the unit of the bounds.
-        size: width and height of a bin; doubled until the lists have at most `MAX_MEAN_ENTRIES` per cell and bin.
+        size: width and height of a bin; doubled while the lists have more than `MAX_MEAN_ENTRIES` per cell and bin.
 
     Returns:
         The lists of the cells that overlap each bin.
     """
-    if launches.bounded:
-        return _build_in_parallel(launches, bounds, cells, extent, size)
-    while True:
-        columns, rows = (-(-side // size) for side in extent)
-        ends = np.zeros(columns * rows + 1, np.int32)
-        with compilation_options(optimised=False):
-            _count_cells(cells, size, columns, bounds, ends)
-        starts = np.cumsum(ends, dtype=np.int64)
-        if starts[-1] <= MAX_MEAN_ENTRIES * (cells + columns * rows):
-            break
-        size *= 2
-    entries = np.empty(max(1, starts[-1]), np.int32)
-    with compilation_options(optimised=False):
-        _list_cells(cells, size, columns, bounds, starts[:-1].astype(np.int32), entries)
-    return Bins(size, columns, ends[1:].reshape(rows, columns), starts.astype(np.int32), entries)
-
-
-def _build_in_parallel(launches: Launches, bounds: Any, cells: int, extent: tuple[int, int], size: int) -> Bins:
     corners = launches.download(bounds).reshape(cells, 2, 2)
     while True:
         columns, rows = (-(-side // size) for side in extent)
         bins_per_cell = np.maximum(corners[:, 1] // size - corners[:, 0] // size + 1, 0).prod(axis=1, dtype=np.int64)
         ends = np.cumsum(bins_per_cell)
-        if ends[-1] <= MAX_MEAN_ENTRIES * (cells + columns * rows):
+        total = int(ends[-1])
+        if total <= MAX_MEAN_ENTRIES * (cells + columns * rows):
             break
         size *= 2
-    total = int(ends[-1])
+    if not launches.bounded:
+        lengths, entries = np.zeros(columns * rows, np.int32), np.empty(max(1, total), np.int32)
+        with compilation_options(optimised=False):
+            _count_cells(cells, size, columns, bounds, lengths)
+            starts = np.concatenate([[0], np.cumsum(lengths)]).astype(np.int32)
+            _list_cells(cells, size, columns, bounds, starts[:-1].copy(), entries)
+        return Bins(size, columns, lengths.reshape(rows, columns), starts, entries)
     counts, cell_ends = launches.upload(np.zeros(columns * rows, np.int32)), launches.upload(ends.astype(np.int32))
     bins, positions, entries = (launches.array(np.int32, max(1, total)) for _ in range(3))
     launches.launch(
@@ -137,19 +129,19 @@ def _bin_range(cell, size, bounds: ti.template()):
 
 
 @ti.kernel
-def _count_cells(cells: ti.i32, size: ti.i32, columns: ti.i32, bounds: Integers, ends: Integers):
-    """Count the cells of every bin; the count of bin n is in `ends[n + 1]`."""
+def _count_cells(cells: ti.i32, size: ti.i32, columns: ti.i32, bounds: Integers, counts: Integers):
+    """Count the cells of every bin."""
     ti.loop_config(serialize=True)
     for cell in range(cells):
         left, right, top, bottom = _bin_range(cell, size, bounds)
         for row in range(top, bottom):
             for column in range(left, right):
-                ends[row * columns + column + 1] += 1
+                counts[row * columns + column] += 1
 
 
 @ti.kernel
 def _list_cells(cells: ti.i32, size: ti.i32, columns: ti.i32, bounds: Integers, ends: Integers, entries: Integers):
-    """List the cells of every bin; `ends` holds the start of each list before, and its end after."""
+    """List the cells of every bin; `ends`, at first the start of each list, is updated to its end."""
     ti.loop_config(serialize=True)
     for cell in range(cells):
         left, right, top, bottom = _bin_range(cell, size, bounds)
@@ -187,7 +179,7 @@ def _assign_entries(
     for entry in range(first, end):
         cell = owner_of(entry, cells, ends)
         left, right, top, bottom = _bin_range(cell, size, bounds)
-        # Number of the entry among those of the cell, which end at `ends[cell]`.
+        # Index of the entry among those of its cell.
         n = (right - left) * (bottom - top) + entry - ends[cell]
         bins[entry] = (top + n // (right - left)) * columns + left + n % (right - left)
         positions[entry] = ti.atomic_add(counts[bins[entry]], 1)

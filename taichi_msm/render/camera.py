@@ -21,8 +21,8 @@ from taichi_msm.scene.section import FRAME_TOLERANCE, MAX_SUPERSAMPLE, MIN_MAGNI
 
 Array = NDArray[np.float64]
 
-# Presets oblique and fit: direction to the eye, 50 degrees above the sheet and from its lower edge; field of view
-# [degrees].
+# Presets oblique and fit: direction from the target to the eye, over the lower edge of the sheet and 50 degrees above
+# it; field of view [degrees].
 OBLIQUE_DIRECTION = np.array([0.0, -0.64, 0.77])
 OBLIQUE_FOV = 32.0
 
@@ -51,11 +51,11 @@ class View(NamedTuple):
     scale: Array  # pixels per metre at w = 1, horizontal and vertical, shape (2,)
     centre: Array  # principal point [px], shape (2,)
     size: Array  # width and height of the picture [px], shape (2,)
-    distance: float  # from the eye to the target [m]; the initial one for a moving camera
+    distance: float  # from the eye to the target, at the start [m]
     pinhole: bool  # whether the projection is perspective
     lens: Lens | None = None
-    baseline: float = 0.0  # distance to the companion of a parallel stereo pair, along the x axis [m]
-    companion: View | None = None  # second camera of the stereo pair, whose key `beside` names this one
+    baseline: float = 0.0  # distance to the companion along the x axis [m]; 0 unless the cameras are parallel
+    companion: View | None = None  # second camera of the stereo pair, whose key `beside` names this camera
     light_view: View | None = None  # camera that carries the light; None if it is this camera
 
     @property
@@ -112,7 +112,7 @@ class View(NamedTuple):
         return (self.scale[0] * self.baseline / w).astype(np.float32)
 
     def centred_at(self, pixel: tuple[float, float]) -> View:
-        """Return the view moved so that X = Y = 0 along the line of sight of a pixel's centre; the first is (0, 0)."""
+        """Return a copy with X = Y = 0 along the line of sight of the centre of a pixel, (column, row) from (0, 0)."""
         matrix, centre = self.matrix.copy(), self.undistort(np.array(pixel) + 0.5)
         for row in (0, 1):
             matrix[row] -= centre[row] * matrix[2]
@@ -212,7 +212,7 @@ def _companion(camera: Camera, scene: Scene, reference: View) -> View:
 
 
 def pair_transform(camera: AnyCamera) -> dict[str, Any]:
-    """Return the transform from the reference camera of a camera to the camera, in the convention of stereoCalibrate.
+    """Return the transform from a camera's reference camera to the camera, in the convention of stereoCalibrate.
 
     Returns:
         "beside": name of the reference camera; "rotation", 3 x 3, and "translation" [m] with X_this = R X_reference +
@@ -240,7 +240,7 @@ def is_moving(scene: Scene, name: str = "") -> bool:
 
 
 def camera_problems(scene: Scene) -> Iterator[Problem]:
-    """Yield the problems of the cameras of a scene and of requested labels of stereo pairs."""
+    """Yield the problems of the cameras of a scene, and of the labels of stereo pairs that it requests."""
     is_valid = True
     for name, camera in scene.render.all_cameras.items():
         problem = next(_single_camera_problems(camera, scene, name), None) if isinstance(camera, Camera) else None
@@ -253,7 +253,7 @@ def camera_problems(scene: Scene) -> Iterator[Problem]:
 
 
 def _single_camera_problems(camera: Camera, scene: Scene, name: str) -> Iterator[Problem]:
-    """Yield the problems of a camera, keys relative to its section; those after the first may be consequences."""
+    """Yield the problems of a camera, with keys relative to its section; the first may be the cause of the others."""
     if camera.beside is None:
         yield from _extrinsics_problems(camera, scene)
     else:
@@ -278,7 +278,7 @@ def _placement_problems(camera: Camera, scene: Scene, name: str) -> Iterator[Pro
 
 
 def _rotation_fault(rotation: Array) -> str:
-    """Describe why a matrix is not a rotation; return "" within 1e-3 of one."""
+    """Return why a matrix is not a rotation; "" for a rotation, with a tolerance of 1e-3."""
     deviation = np.abs(rotation @ rotation.T - np.eye(3)).max()
     if deviation <= 1e-3 and np.linalg.det(rotation) > 0:
         return ""
@@ -308,7 +308,7 @@ def _pair_problems(scene: Scene) -> Iterator[Problem]:
 
 
 def _extrinsics_problems(camera: Camera, scene: Scene) -> Iterator[Problem]:
-    """Yield the problems of a camera's extrinsics at any frame."""
+    """Yield the problems of a camera's extrinsics in all frames."""
     key = next((name,) for name in ("eye", "pose", "poses") if getattr(camera, name) is not None)
     if camera.pose is not None and (fault := _rotation_fault(np.array(camera.pose.rotation))):
         yield Problem(("pose", "rotation"), fault)
@@ -317,7 +317,7 @@ def _extrinsics_problems(camera: Camera, scene: Scene) -> Iterator[Problem]:
         begin, end, duration = camera.poses[0][0], camera.poses[-1][0], scene.time.duration
         tolerance = FRAME_TOLERANCE / scene.time.frames_per_second
         gap = camera.poses[min(1, len(camera.poses) - 1)][0] - max(begin, 0.0)
-        # Longer gaps indicate times in another unit than seconds.
+        # A longer gap indicates that the unit of time is not the second.
         if gap > 1e5 or (len(camera.poses) > 2 and gap > 5 * duration):
             message = f"its first poses are {gap:.6g} s apart, and the scene lasts {duration:g} s"
             yield Problem(key, f"{message}; set poses_time, the unit of its times: ms, us or ns")
@@ -342,7 +342,7 @@ def _extrinsics_problems(camera: Camera, scene: Scene) -> Iterator[Problem]:
                 yield Problem(key, f"{eye} is also the target{when}; move one of them")
             if not np.linalg.norm(np.cross(toward, _normalised(np.array(up)))) > 1e-9:
                 yield Problem(("up",), f"{up} is zero or along the line of sight{when}; take a direction across it")
-        # The matrix must be finite in f32, also after kernels scale it by the samples per pixel.
+        # The matrix must be finite in f32, also multiplied by the samples per pixel.
         if np.abs(_pinhole(camera, scene, time).matrix).max() > float(np.finfo(np.float32).max) / MAX_SUPERSAMPLE:
             message = f"is too far away for its focal length{when}; move it nearer"
             if camera.eye is not None and camera.intrinsics is None:
@@ -442,7 +442,7 @@ def _top_scale(scene: Scene) -> float:
 def _top(scene: Scene) -> View:
     """Return the orthographic view from above, with the sheet at rest centred and as large as the picture allows.
 
-    The eye (depth 0) is above the sheet, at a height equal to the larger side of the sheet.
+    The height of the eye (depth 0) is the larger side of the sheet.
     """
     (width_px, height_px), scale, distance = scene.render.size, _top_scale(scene), max(scene.sheet.size)
     rows = [[scale, 0, 0, width_px / 2], [0, -scale, 0, height_px / 2], [0, 0, 0, 1], [0, 0, -1, distance]]
@@ -453,12 +453,12 @@ def _top(scene: Scene) -> View:
 
 def _pinhole(camera: Camera, scene: Scene, time: float) -> View:
     placement = extrinsics(camera, time)
-    # The light has its initial intensity while the camera moves, from the initial distance.
+    # The distance is that at the start, so the light of a moving camera keeps its intensity.
     return _pinhole_at(camera, scene, placement._replace(distance=extrinsics(camera, 0.0).distance))
 
 
 def _pinhole_at(camera: Camera, scene: Scene, placement: Extrinsics) -> View:
-    """Return the view of a pinhole camera with other extrinsics than its own."""
+    """Return the view of a pinhole camera, with these extrinsics in place of its own."""
     (width_px, height_px), (eye, axes, distance) = scene.render.size, placement
     right, up, toward = axes
     depth = -toward
@@ -483,11 +483,11 @@ def _preset(name: str, scene: Scene) -> Camera:
 
 
 def _fit(scene: Scene) -> Camera:
-    """Return the fit preset: the sheet at rest fills the picture, except for a margin of 2 %.
+    """Return the preset fit: the sheet at rest fills the picture, except for a margin of 2 %.
 
-    In camera axes (up, forward), from the sheet's centre, the upper corners are at (a, b) and the lower ones at (-a,
-    -b). With the eye at (-a b / d, -d) they are projected to the tangents a / d and -a / d, so the sheet is centred.
-    The lower edge is nearest: half its width has the tangent width / 2 / (d - b).
+    In the camera's axes up and forward, from the sheet's centre, the upper edge is at (a, b) and the lower edge at
+    (-a, -b). From an eye at (-a b / d, -d) they have the tangents a / d and -a / d, so the sheet is centred. The lower
+    edge is the nearer one: half its width has the tangent width / 2 / (d - b).
     """
     (height, width), (width_px, height_px) = scene.sheet.size, scene.render.size
     axes = _look_at_axes(OBLIQUE_DIRECTION.tolist(), (0, 0, 0), (0, 1, 0))
@@ -500,10 +500,10 @@ def _fit(scene: Scene) -> Camera:
 
 
 def _oblique(scene: Scene) -> Camera:
-    """Return the oblique preset: the sheet at rest fits into the picture, with a margin of 4 % in distance."""
+    """Return the preset oblique: the sheet at rest fits into the picture, with a margin of 4 % in distance."""
     (height, width), (width_px, height_px) = scene.sheet.size, scene.render.size
     toward = OBLIQUE_DIRECTION / np.linalg.norm(OBLIQUE_DIRECTION)
-    axes = extrinsics(Camera(eye=tuple(toward), fov=OBLIQUE_FOV), 0.0).axes
+    axes = _look_at_axes(toward.tolist(), (0, 0, 0), (0, 1, 0))
     corners = np.array([[x, y, 0.0] for x in (-width / 2, width / 2) for y in (-height / 2, height / 2)]) @ axes.T
     half_height = np.tan(np.radians(OBLIQUE_FOV) / 2)
     half = np.array([half_height * width_px / height_px, half_height])
@@ -516,7 +516,7 @@ class Extrinsics(NamedTuple):
 
     eye: Array  # position [m], shape (3,)
     axes: Array  # unit vectors right, up and toward the camera, as rows, shape (3, 3)
-    distance: float  # from the eye to the target, for a pose to the centre of the sheet at rest [m]
+    distance: float  # from the eye to the target; for a pose, to the centre of the sheet at rest [m]
 
 
 def extrinsics(camera: Camera, time: float) -> Extrinsics:
@@ -540,20 +540,20 @@ def extrinsics(camera: Camera, time: float) -> Extrinsics:
 
 
 def _look_at_axes(eye: Sequence[float], target: Sequence[float], up: Sequence[float]) -> Array:
-    """Return the axes of a camera, as rows; `up`, of any length, is vertical in the picture."""
+    """Return the axes of a camera, as in `Extrinsics`; `up`, of any length, is vertical in the picture."""
     toward = _normalised(np.subtract(eye, target))
     right = _normalised(np.cross(_rescaled(np.array(up)), toward))
     return np.stack([right, np.cross(toward, right), toward])
 
 
 def _normalised(vector: Array) -> Array:
-    """Normalise a vector; the zero vector is returned unchanged."""
+    """Return the unit vector; a zero vector is unchanged."""
     smaller = _rescaled(vector)
     return smaller / (float(np.linalg.norm(smaller)) or 1.0)
 
 
 def _rescaled(vector: Array) -> Array:
-    """Scale a vector by a power of 2, without rounding, so that its squares neither overflow nor underflow."""
+    """Scale a vector by a power of 2, which is exact, so that its squares neither overflow nor underflow."""
     return np.ldexp(vector, -math.frexp(float(np.abs(vector).max()))[1])
 
 
@@ -564,7 +564,7 @@ def _nearest_rotation(matrix: Array) -> Array:
 
 
 def _interpolate_keyframes(value: Sequence[float] | Sequence[Sequence[float]], time: float) -> Sequence[float]:
-    """Return a vector at a time: itself, or linear interpolation of keyframes (time [s], x, y, z), constant beyond."""
+    """Return a constant vector as it is; interpolate keyframes (time [s], x, y, z) linearly, constant beyond them."""
     keys = np.array(value)
     if keys.ndim == 1:
         return value  # type: ignore[return-value]
@@ -572,7 +572,7 @@ def _interpolate_keyframes(value: Sequence[float] | Sequence[Sequence[float]], t
 
 
 def _interpolate_poses(poses: Sequence[Sequence[float]], time: float) -> tuple[Array, Array]:
-    """Return eye and camera-to-world rotation at a time: positions interpolated linearly, rotations by slerp."""
+    """Return the eye, interpolated linearly, and the rotation from the camera to the world, by slerp."""
     from scipy.spatial.transform import Rotation, Slerp
 
     times = [row[0] for row in poses]

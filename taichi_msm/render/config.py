@@ -1,41 +1,35 @@
 """Compile-time configuration and G-buffer layout of the rasteriser (kernel 2).
 
 A sample is a pixel, or with supersampling one of several per pixel. The samples of a tile form a vector: 4 x 4 samples
-for the 16 lanes of AVX-512, 4 x 2 for 8 lanes, 4 x 1 for 4 lanes, and a single sample on a GPU. The planes of the
-G-buffer (depth, normals, ...) have one vector per tile each. On a CPU the unit of parallel work is a band, some rows of
+for the 16 lanes of AVX-512, 4 x 2 for 8 lanes, 4 x 1 for 4 lanes, and a single sample on a GPU. Each plane of the
+G-buffer (depth, normals, ...) has one vector per tile. On a CPU the unit of parallel work is a band, some rows of
 tiles, and each worker has the G-buffer of one band.
 
-Names that the functions of kernel 2 share:
+Names that the functions of kernel 2 share, in addition to the fields of `DrawingConfig` and `Band`:
 
-    config                compile-time configuration
-    uniforms, sizes       constants of the view; sizes and counters (uniforms.py)
     position              positions of the mass points [m], shape (rows, cols, 3)
-    rows, cols            number of rows and columns of mass points
+    texels                levels of the texture, as returned by `pyramid`
+    colours, labels       colours of all pixels, as words or bytes; labels of all pixels, one label after the other
+    first, end, ended     first index of a launch; index after the last one; counter of finished threads (`end_thread`)
+
     i, j                  row and column of a mass point or a cell
-    nodes                 projected mass points, as stored by `project`
     corner                first entry of a cell's upper left mass point in `nodes`
-    distorted_entry       first entry of its distorted position in `nodes`, as stored by `store_distorted`
-    near, depth           near plane [m]; depth [m]
-    facing                1 if the front of a cell is visible, -1 for its back
+    distorted_entry       first entry of its distorted position in `nodes`
     quad_column, quad_row column and row of sub-quads in their cell
     quad_side             side of the sub-quads, as a fraction of the cell's
     lower                 whether a triangle is below the diagonal of its sub-quad; for cells that are not invertible
     enlargement           enlargement of such a triangle, as a fraction of its side
     s, t                  coordinates on a triangle, to the right and down
     across, along         coordinates in a cell, to the right and down, from 0 to 1
-    normal                list of three components, of any length
-    samples               G-buffer; with lens distortion also the undistortion map
-    texels                levels of the texture, as returned by `pyramid`
-    colours, labels       colours of all pixels, as words or bytes; labels of all pixels, one label after the other
+
     entry                 first entry of a tile in the G-buffer
-    visible, inside       masks of the samples of a tile
-    colour                list of red, green and blue, 0 to 255
     left, top             first column and row of a tile [samples]
-    row, end_row          first row of pixels, and the row after the last one
-    slope_x, slope_y      gradient of the grey level, to the right and down [1/texel]
     x, y                  columns and rows of the undistorted samples of a tile, one number per lane
-    lens                  name of the lens model; empty without lens distortion
-    first, end, ended     first index of a launch; index after the last one; counter of finished threads (`end_thread`)
+    visible, inside       masks of the samples of a tile
+    normal                list of three components, of any length
+    colour                list of red, green and blue, 0 to 255
+    slope_x, slope_y      gradient of the grey level, to the right and down [1/texel]
+    row, end_row          first row of pixels, and the row after the last one
 
 Modules with kernels have no `from __future__ import annotations`, because Taichi reads the annotations.
 """
@@ -90,7 +84,7 @@ class DrawingConfig(NamedTuple):
 
     @property
     def unordered(self) -> bool:
-        """Whether the order of the cells at a sample is arbitrary, as on a GPU; otherwise it is row by row."""
+        """Whether the cells at a sample come in any order, as on a GPU; on a CPU they come row by row."""
         return self.lanes == 1
 
     @property
@@ -110,16 +104,16 @@ class DrawingConfig(NamedTuple):
 
     @property
     def map_planes(self) -> int:
-        """Vectors per tile of the undistortion map; 0 without lens distortion.
+        """Vectors per tile of the undistortion map, 0 without lens distortion.
 
-        They are x and y; with `map_has_steps` four steps; on a CPU the bounding box of the tile.
+        x and y; with `map_has_steps` also four steps; on a CPU also the bounding box of the tile.
         """
-        return (6 if self.map_has_steps else 2) + (not self.unordered) if self.lens else 0
+        return (6 if self.map_has_steps else 2) + (not self.unordered) if self.has_distortion else 0
 
     @property
     def map_has_steps(self) -> bool:
         """Whether the undistortion map includes the steps to the next samples."""
-        return bool(self.lens) and (self.tissue or self.wireframe)
+        return self.has_distortion and (self.tissue or self.wireframe)
 
     @property
     def band_rows(self) -> int:
@@ -153,7 +147,7 @@ class DrawingConfig(NamedTuple):
 
 @cache
 def _planes(config: DrawingConfig) -> Any:
-    """Number the planes that a configuration needs."""
+    """Return the index of each plane that a configuration needs, by name."""
     needed = {
         **{plane: name in config.labels for name, label in LABELS.items() for plane in label.planes},
         **dict.fromkeys(("depth", "texel_x", "texel_y"), True),  # of the visible surface; texture coordinates [texels]
@@ -170,13 +164,13 @@ def _planes(config: DrawingConfig) -> Any:
 
 
 class Band(NamedTuple):
-    """Arguments of a kernel, and a rectangle of the picture [samples]: a band, or a part of it on a GPU."""
+    """Arguments of a kernel, and a rectangle of the picture [samples]: a band on a CPU, a sample or pixel on a GPU."""
 
     config: DrawingConfig
     uniforms: Any  # constants of the view (uniforms.py)
     sizes: Any  # sizes and counters (uniforms.py)
     nodes: Any  # projected mass points (geometry.py)
-    samples: Any  # G-buffer and undistortion map
+    samples: Any  # G-buffer; with lens distortion also the undistortion map
     rows: Any  # of mass points
     cols: Any
     subdivisions: Any  # sub-quads along a side of a cell
@@ -187,9 +181,9 @@ class Band(NamedTuple):
     tiles_across: Any  # tiles in a row of the picture
     first: Any = 0  # first entry of the band in `samples`, at the left edge of the picture
     map_start: Any = 0  # first entry of its undistortion map in `samples`
-    left: Any = 0.0  # first column
-    right: Any = 0.0  # column after the last one
-    top: Any = 0
+    left: Any = 0.0  # first column, and the column after the last one
+    right: Any = 0.0
+    top: Any = 0  # first row, and the row after the last one
     bottom: Any = 0
 
 
@@ -285,8 +279,8 @@ def tile_range(first_column, end_column, first_row, end_row, band: ti.template()
         band: band, whose edges are `left`, `right`, `top` and `bottom`.
 
     Returns:
-        First column of tiles, column after the last one; first row of tiles, counted from the band's top, row after the
-        last one.
+        First column of tiles, and the column after the last one; first row of tiles from the band's top, and the row
+        after the last one.
     """
     tile_width, tile_height = ti.static((band.config.tile_width, band.config.tile_height))
     return (
@@ -322,7 +316,7 @@ def _map_entry(entry, band: ti.template()):
 def undistorted_centres(left, top, entry, band: ti.template()):
     """Return the undistorted x and y of the sample centres of a tile [samples], one per lane.
 
-    They are INVALID_COORDINATE beyond the limit of the lens.
+    Beyond the limit of the lens they are INVALID_COORDINATE.
 
     Args:
         left: first column of the tile [samples].

@@ -1,14 +1,14 @@
 """Coverage: the nearest surface at every sample, of the sheet and of the instruments.
 
-The refined surface is not stored. For a sample inside the outline of a cell:
+For a sample inside the outline of a cell:
 
 1. Solve the two equations of geometry.py for the sub-quad.
 2. Choose its triangle by the side of the diagonal.
 3. Solve two linear equations for the point on the triangle.
 
-A cell that is folded or extends behind the camera is drawn triangle by triangle.
+So the refined surface is not stored. A cell that is folded or extends behind the camera is drawn triangle by triangle.
 
-`taichi_msm.shapes` intersects the instruments with the line of sight through a sample, P = O + D t at depth t.
+For an instrument, intersect its shape (`taichi_msm.shapes`) with the line of sight.
 
 To add an output per pixel, add its planes in labels.py or config.py and its values in `_store_surface`.
 """
@@ -34,7 +34,7 @@ from taichi_msm.render.config import (
     triple,
     undistorted_centres,
 )
-from taichi_msm.render.lens_kernels import store_distorted
+from taichi_msm.render.lens_kernels import distorted_point
 from taichi_msm.render.undistortion import INVALID_COORDINATE
 from taichi_msm.shapes import SHAPES
 from taichi_msm.system.runtime import ti
@@ -48,18 +48,18 @@ class Cell(NamedTuple):
     j: Any  # column
     rows: Any  # of cells of the sheet
     cols: Any
-    texel_x: Any  # texture coordinates of the upper left mass point [texels]: integer part
+    texel_x: Any  # integer parts of the texture coordinates of the upper left mass point [texels]
     texel_y: Any
-    fraction_x: Any  # their fractional part
+    fraction_x: Any  # fractional parts
     fraction_y: Any
-    texels_across: Any  # width of the cell [texels]
+    texels_across: Any  # width and height of the cell [texels]
     texels_down: Any
     normal: Any  # entry of the normal at the upper left mass point
 
 
 @ti.func
 def _max_edge(p_x, p_y, q_x, q_y, box: ti.template(), facing):
-    """Return the maximum of `geometry.edge` over the samples within a box, rounded as at the samples themselves."""
+    """Return the largest `geometry.edge` in a box: left, right, top and bottom [samples]."""
     left, right, top, bottom = ti.static(box)
     x = ti.select((q_y - p_y) * facing > 0.0, left, right)
     y = ti.select((q_x - p_x) * facing > 0.0, bottom, top)
@@ -68,7 +68,7 @@ def _max_edge(p_x, p_y, q_x, q_y, box: ti.template(), facing):
 
 @ti.func
 def _may_cover(box: ti.template(), facing, outline: ti.template()):
-    """Return whether a cell may cover samples within a box: left, right, top and bottom [samples]."""
+    """Return whether a cell may cover samples in a box."""
     p, q = ti.static((outline.x, outline.y))
     return (
         _max_edge(p[0], q[0], p[2], q[2], box, -facing) >= 0.0
@@ -95,7 +95,7 @@ def _cover_tile(
     depth = geometry.depth_at(s, t, triangle)
     visible = inside & (depth < band.samples[entry + plane.depth])
     if ti.static(config.unordered):
-        # At equal depth the first cell and triangle win, in any order of processing.
+        # At equal depth the first cell and triangle are visible, in any order of processing.
         cell_index = cell.i * cell.cols + cell.j
         piece = (quad_row * band.subdivisions + quad_column) * 2.0 + ti.select(triangle.below, 0.0, 1.0)
         stored_cell, stored_piece = band.samples[entry + plane.cell], band.samples[entry + plane.triangle]
@@ -114,9 +114,9 @@ def cover_cell(i, j, invertible, first, end, outline: ti.template(), band: ti.te
     Args:
         i: row of the cell.
         j: column of the cell.
-        invertible: whether the cell is drawn by inverting its bilinear map, instead of triangle by triangle.
-        first: first triangle that is drawn; 0 if the cell is inverted.
-        end: triangle after the last one; 1 if the cell is inverted.
+        invertible: as in `Patch`.
+        first: first triangle that is drawn; 0 for an invertible cell.
+        end: triangle after the last one; 1 for an invertible cell.
         outline: projected corners of the cell.
         band: the band, whose G-buffer is updated.
     """
@@ -148,8 +148,8 @@ def cover_cell(i, j, invertible, first, end, outline: ti.template(), band: ti.te
         )
         tiles = ti.max(end_tile_row - first_tile_row, 0) * ti.max(end_tile - first_tile, 0)
         tile, tile_row = first_tile, first_tile_row
-        # Software pipelining: compute the sub-quads of a tile, then cover the previous tile. The processor overlaps the
-        # two, as they are independent. `pending` is the entry of the previous tile, or -1.
+        # Software pipelining: find the sub-quads of a tile, then cover the previous tile. The two are independent, so
+        # the processor overlaps them. `pending` is the entry of the previous tile, or -1.
         pending = -1
         pending_x, pending_y, pending_inside = float_vector(0), float_vector(0), float_vector(0)
         pending_column, pending_row = float_vector(0), float_vector(0)
@@ -174,7 +174,7 @@ def cover_cell(i, j, invertible, first, end, outline: ti.template(), band: ti.te
                         if ti.static(config.refined):
                             quad_column, quad_row = geometry.find_quads(x, y, inside, band.subdivisions, patch)
                 else:
-                    # Only within the bounds: beyond them rounding may cover samples, depending on the tile shape.
+                    # Samples beyond the bounds are left out: rounding could cover them, depending on the tile shape.
                     sample_x, sample_y = sample_centres(tile_x, tile_y, config)
                     inside = (
                         (sample_x > ti.cast(first_column, ti.f32))
@@ -201,7 +201,7 @@ def cover_cell(i, j, invertible, first, end, outline: ti.template(), band: ti.te
 
 @cache
 def _compile_ray(shape: str) -> Callable[..., Any]:
-    """Return the Taichi function of `Shape.build_ray`."""
+    """Return `Shape.build_ray` of a shape as a Taichi function."""
     return ti.func(SHAPES[shape].build_ray(Operations(ti.sqrt, ti.log, ti.max, ti.min, ti.select, ti.func)))
 
 
@@ -217,12 +217,12 @@ def intersect_instrument(x, y, index, uniforms: ti.template(), shapes: ti.templa
         shapes: names of the shapes of all instruments.
 
     Returns:
-        Depth of the first intersection [m], INFINITY without one; three components of its outward normal in the
-        camera's frame, of any length.
+        Depth of the first intersection [m], INFINITY without one; three components of the outward normal there, in the
+        camera's frame and of any length.
     """
     base = uni.INSTRUMENTS + index * uni.INSTRUMENT_STRIDE
     tip, axis = base + uni.TIP, base + uni.AXIS
-    # The line of sight is P = O + D t from the tip: t is the depth beyond that of the tip.
+    # Relative to the tip, the line of sight is O + D t, with t the depth.
     start = uniforms[tip + 2] * (-1.0)
     across, up = geometry.line_of_sight(x, y, uniforms)
     w = geometry.w_at(start, uniforms)
@@ -230,6 +230,7 @@ def intersect_instrument(x, y, index, uniforms: ti.template(), shapes: ti.templa
     d_x, d_y = across * uniforms[uni.PINHOLE], up * uniforms[uni.PINHOLE]
     a_x, a_y, a_z = triple(uniforms, axis)
     length, radius = uniforms[base + uni.LENGTH], uniforms[base + uni.RADIUS]
+    # Scalar products of O, D and the axis A.
     d_d, d_a = d_x * d_x + d_y * d_y + 1.0, d_x * a_x + d_y * a_y - a_z
     o_a, o_d, o_o = o_x * a_x + o_y * a_y, o_x * d_x + o_y * d_y, o_x * o_x + o_y * o_y
     intersect_first = ti.static(_compile_ray(shapes[0]))
@@ -276,7 +277,7 @@ def cover_instruments(band: ti.template()):
         top, bottom = uniforms[base + uni.TOP], uniforms[base + uni.BOTTOM]
         low_x, high_x, low_y, high_y = left, right, top, bottom
         if ti.static(config.has_distortion):
-            # Each tile is tested below, by its undistorted box.
+            # Tiles are selected below, by their undistorted boxes.
             low_x, high_x, low_y, high_y = band.left, band.right, band.top, band.bottom
         if low_y < band.bottom and high_y > band.top:
             first_column, end_column, first_row, end_row = clip(low_x, high_x, low_y, high_y, band)
@@ -301,7 +302,7 @@ def _cell_at(i, j, normal_entry, patch: ti.template(), band: ti.template()):
     """Return the `Cell` with a mass point as its upper left corner."""
     rows, cols = band.rows - 1, band.cols - 1
     texture_width, texture_height = band.sizes[uni.LEVELS + 1], band.sizes[uni.LEVELS + 2]
-    # In f64, for an accurate fraction of a texel with any number of cells and texels.
+    # In f64, so that the fraction of a texel is accurate for any number of cells and texels.
     texel_x = ti.cast(j, ti.f64) * texture_width / cols - 0.5
     texel_y = ti.cast(i, ti.f64) * texture_height / rows - 0.5
     whole_x, whole_y = ti.floor(texel_x), ti.floor(texel_y)
@@ -320,9 +321,9 @@ def _cell_at(i, j, normal_entry, patch: ti.template(), band: ti.template()):
 
 @ti.func
 def store_point(position: ti.template(), i, j, band: ti.template()):
-    """Store the projection of a mass point, and as configured its distorted position and its normal.
+    """Store the projection of a mass point; as configured, also its distorted position and its normal.
 
-    The normal is in the camera's frame for tissue, and in the world's for the headlight.
+    Normals for tissue are in the camera's frame, those for the headlight in the world's.
 
     Args:
         position: positions of the mass points [m], shape (rows, cols, 3).
@@ -334,7 +335,10 @@ def store_point(position: ti.template(), i, j, band: ti.template()):
     geometry.project(position, i, j, band.cols, band.uniforms, band.nodes, False)
     entry, normal_entry, distorted_entry = geometry.point_entries(i * band.cols + j, band)
     if ti.static(config.has_distortion):
-        store_distorted(distorted_entry, entry, band.uniforms, band.nodes, config.lens)
+        screen = entry + geometry.SCREEN
+        x, y, is_valid = distorted_point(band.nodes[screen], band.nodes[screen + 1], band.uniforms, config.lens)
+        band.nodes[distorted_entry], band.nodes[distorted_entry + 1] = x, y
+        band.nodes[distorted_entry + 2] = ti.cast(is_valid and band.nodes[entry + 2] > band.near, ti.f32)
     if ti.static(config.headlit or config.tissue):
         i0, i1 = ti.max(i - 1, 0), ti.min(i + 1, band.rows - 1)
         j0, j1 = ti.max(j - 1, 0), ti.min(j + 1, band.cols - 1)
@@ -351,7 +355,7 @@ def store_point(position: ti.template(), i, j, band: ti.template()):
 
 @ti.func
 def _normal_at(across, along, cell: ti.template(), band: ti.template()):
-    """Interpolate the normals of the mass points bilinearly; not normalised."""
+    """Interpolate the normals of the mass points bilinearly; return normals of any length."""
     corners = ti.static(geometry.corner_entries(cell.normal, band.cols, geometry.NORMAL_STRIDE))
     a, b, c, d = [triple(band.nodes, entry) for entry in corners]
     return [
@@ -376,11 +380,11 @@ def _headlight(normal: ti.template(), uniforms: ti.template()):
 
 @ti.func
 def _footprint(entry, x, y, s, t, texels_x, texels_y, triangle: ti.template(), band: ti.template()):
-    """Return the squared size of samples on the texture, in units of FULL_RESOLUTION_TEXELS, and the visible side.
+    """Return the squared size of samples on the texture, and 1 where the front of the triangle is visible, else -1.
 
-    From x = X / w the Jacobian of (x, y) with respect to (s, t) is (R_1, D_1; R_2, D_2) / w, with R_1 = R_x - x R_w and
-    so on. Its inverse maps a sample to the triangle, and `texels_x` and `texels_y`, the sides of the sub-quad [texels],
-    to the texture. The size is the larger of width and height; the side is 1 for the front of the triangle, else -1.
+    The size is the larger of width and height, in units of FULL_RESOLUTION_TEXELS. As x = X / w, the Jacobian of (x, y)
+    with respect to (s, t) is (R_1, D_1; R_2, D_2) / w, with R_1 = R_x - x R_w and so on. Its inverse maps a sample to
+    the triangle; `texels_x` and `texels_y`, the sides of the sub-quad [texels], scale the triangle to the texture.
     """
     p, r, d = ti.static((triangle.p, triangle.r, triangle.d))
     r_1 = r[0] - x * r[2]
@@ -403,9 +407,10 @@ def _footprint(entry, x, y, s, t, texels_x, texels_y, triangle: ti.template(), b
 
 @ti.func
 def _distance_to_line(coordinate, right_coordinate, lower_coordinate):
-    """Return the distance of samples from the nearest mesh line [samples].
+    """Return the distance of samples from the nearest mesh line of one direction [samples].
 
-    The coordinates [cells] run across the lines: at the samples, at the next samples on the right, and below.
+    `coordinate` is that of the samples across the lines [cells]; the others are those of the next samples on the right
+    and below.
     """
     step_right, step_down = right_coordinate - coordinate, lower_coordinate - coordinate
     slope = ti.sqrt(step_right * step_right + step_down * step_down)

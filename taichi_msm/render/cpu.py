@@ -39,10 +39,10 @@ class Bands:
         (rows, cols), (width, height) = shape, size
         self._workers = min(-(-height // config.band_rows), runtime.current_device().threads)
         self._memory = memory = runtime.Memory()
-        # Projected mass points; then for each row of them the first and last undistorted row of the picture.
+        # Projected mass points; then, for each row of them, the first and last row of the undistorted picture.
         self._nodes = memory.array("f32", 0, rows * (cols * geometry.POINT_STRIDE + 2))
         tiles_of_band = config.band_lines * config.tiles_across(width)
-        # With lens distortion the undistortion map, each of its bands followed by its bounds; then a band per worker.
+        # The undistortion map, in which each band ends with its bounds; then the G-buffer of a band per worker.
         map_vectors = -(-height // config.band_rows) * (tiles_of_band * config.map_planes + config.has_distortion)
         self._samples = memory.array("f32", config.lanes, map_vectors + self._workers * tiles_of_band * config.planes)
 
@@ -67,7 +67,7 @@ class Bands:
         # Tiles are written completely, and the last one of a row may extend beyond the picture.
         stride = config.tiles_across(width) * config.tile_width if config.writes_words else width
         picture = np.empty((height, stride, 3) if config.picture else (1, 4, 3), np.uint8)
-        # Without labels the argument is unused; passing a Taichi array takes half the time of a NumPy array.
+        # Without labels the argument is unused: any Taichi array, which is passed in half the time of a NumPy array.
         labels: Any = self._nodes
         if config.labels:
             labels = np.zeros(values_per_pixel(config.labels) * width * height, np.float32)
@@ -81,7 +81,7 @@ class Bands:
 
 
 def _tiled_map(table: NDArray[np.float32], config: DrawingConfig) -> NDArray[np.float32]:
-    """Arrange an undistortion map in bands and tiles, and append the bounding boxes of each tile and each band."""
+    """Arrange an undistortion map in bands of tiles; append the box of its samples to each tile and to each band."""
     rows, columns, planes = table.shape
     band_height, lines = config.band_rows * config.supersample, config.band_lines
     tile_height, tile_width = config.tile_height, config.tile_width
@@ -106,7 +106,7 @@ def _tiled_map(table: NDArray[np.float32], config: DrawingConfig) -> NDArray[np.
 
 @ti.func
 def _project_row(position: ti.template(), i, band: ti.template()):
-    """Project a row of mass points, and store the first and last undistorted row of the picture that it overlaps."""
+    """Project a row of mass points, and store the first and last row of the undistorted picture that it overlaps."""
     cols, nodes = ti.static((band.cols, band.nodes))
     first_row, last_row = INFINITY, -INFINITY
     for j in range(cols):
@@ -148,7 +148,7 @@ def _cover_band(band: ti.template()):
     lines = (band.bottom - band.top + config.tile_height - 1) // config.tile_height
     for tile in range(lines * band.tiles_across):
         clear_tile(band.first + tile * config.planes, band)
-    # Undistorted rows of the samples of the band.
+    # First and last row of the band in the undistorted picture.
     top, bottom = ti.cast(band.top, ti.f32), ti.cast(band.bottom, ti.f32)
     if ti.static(config.has_distortion):
         box = band.samples[band.map_start + config.band_lines * config.map_planes * band.tiles_across]
@@ -189,15 +189,16 @@ def _kernel(config: DrawingConfig) -> Callable[..., None]:
             uniforms: constants of the view, as returned by `view_uniforms`.
             workers: number of workers.
             sizes: sizes and counters, as returned by `sizes_of`; the counters are 0 at the start.
-            nodes: projected mass points, written; shape (rows * cols * POINT_STRIDE + 2 * rows,).
+            nodes: projected mass points, then the rows that they overlap, written; shape
+                (rows * cols * POINT_STRIDE + 2 * rows,).
             samples: undistortion map, then the G-buffer of a band for each worker, written.
             colours: red, green and blue of all pixels, row by row, as words or bytes, written.
-            labels: all pixels of one label after the other, as described by `labels.label_channels`, written.
+            labels: all pixels of one label after the other, written.
         """
         for index in range(workers * ITERATIONS_PER_THREAD):
             if index % ITERATIONS_PER_THREAD == 0:
                 picture = ti.static(read_arguments(uniforms, sizes, nodes, samples, config))
-                # In the same loop: starting another parallel loop takes longer than projecting a sheet of usual size.
+                # In this loop, because the start of another one takes longer than projecting a sheet of usual size.
                 _project_all(position, picture)
                 height = sizes[uni.HEIGHT]
                 tiles_of_band = picture.tiles_across * config.band_lines

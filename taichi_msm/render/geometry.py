@@ -1,13 +1,12 @@
 """Projected mass points, cells and triangles, for one sample or a vector of samples, in f32 or f64.
 
-A point of the surface is represented by (X, Y, w, depth), the product of the camera's matrix and the point. The map is
-linear, so subdividing a projected cell is exact, also in perspective. With s to the right and t down, the surface
-between the four mass points of a cell is
+A projected point is (X, Y, w, depth), the product of the camera's matrix and the point. The product is linear, so the
+subdivision of a projected cell is exact, also in perspective. With s to the right and t down, a cell is the surface
 
-    P(s, t) = A + B s + C t + D s t,    projected to sample (x, y) where    X - x w = 0,  Y - y w = 0.
+    P(s, t) = A + B s + C t + D s t,    and sample (x, y) shows its point with    X - x w = 0,  Y - y w = 0.
 
-A cell is divided into sub-quads, and each of these into two triangles along the diagonal from top left to bottom right.
-Corners are listed row by row: upper left and right, lower left and right.
+A cell is divided into sub-quads, and a sub-quad into two triangles by its diagonal from the upper left to the lower
+right. The order of corners is by rows: upper left and right, lower left and right.
 """
 
 from typing import Any, NamedTuple
@@ -17,24 +16,27 @@ from taichi_msm.render import uniforms as uni
 from taichi_msm.render.config import INFINITY, cross
 from taichi_msm.system.runtime import ti
 
-# Numbers per mass point: X, Y, w, depth, and from SCREEN on its x and y in the picture [samples]. In kernel 2, `nodes`
-# has three blocks: these numbers, the normals, the distorted positions.
-SCREEN, NODE_STRIDE, NORMAL_STRIDE, DISTORTED_STRIDE = uni.SCREEN, 6, 3, lens_kernels.DISTORTED_STRIDE
+# Layout of `nodes`: blocks of projections, normals and distorted positions, each with its stride per mass point. In f64
+# (tracking.py) only the first block exists.
+NODE_STRIDE = 6  # X, Y, w, depth; from SCREEN on x and y in the picture [samples]
+SCREEN = 4
+NORMAL_STRIDE = 3
+DISTORTED_STRIDE = 3  # x and y [samples]; 1 in front of the camera and within the limit of the lens, else 0
 POINT_STRIDE = NODE_STRIDE + NORMAL_STRIDE + DISTORTED_STRIDE
 
-# Enlargement that closes gaps between triangles drawn one by one: a fraction of their side, plus a fraction of the
-# picture's side, the resolution of f32.
+# Enlargement of triangles that are drawn one by one, which closes the gaps between them: a fraction of their side, and
+# a fraction of the picture's side, the resolution of f32.
 ENLARGEMENT = 1e-5
 SCREEN_ENLARGEMENT = 2e-6
 
-# Largest coordinate of a corner with which the bilinear map of a cell is invertible in f32 [samples].
+# Largest coordinate of an invertible cell's corner, a limit of f32 [samples].
 MAX_COORDINATE = float(1 << 16)
 
 
 class Outline(NamedTuple):
     """Projected corners of a cell, and their bounding box [samples]."""
 
-    x: Any  # list of the corners' coordinates
+    x: Any  # lists of the corners' columns and rows
     y: Any
     left: Any  # of the bounding box
     right: Any
@@ -42,11 +44,11 @@ class Outline(NamedTuple):
     bottom: Any
     facing: Any  # 1 if the front is visible, -1 for the back, 0 if the cell is folded
     in_front: Any  # whether all corners are beyond the near plane, in front of the camera
-    behind: Any  # whether no corner is
+    behind: Any  # whether no corner is beyond the near plane
 
 
 class Patch(NamedTuple):
-    """Bilinear surface between four mass points: coefficients A to D, vectors (X, Y, w, depth)."""
+    """Bilinear surface of a cell: coefficients A to D, vectors (X, Y, w, depth)."""
 
     a: Any
     b: Any
@@ -57,11 +59,11 @@ class Patch(NamedTuple):
 
 
 class Triangle(NamedTuple):
-    """Triangle P + R s + D t of a sub-quad, of lists of X, Y, w and depth."""
+    """Triangle P + R s + D t of a sub-quad: lists of X, Y, w and depth."""
 
-    p: Any
-    r: Any
-    d: Any
+    p: Any  # upper left corner
+    r: Any  # side to the right
+    d: Any  # side down
     below: Any  # whether it is the triangle below the diagonal, where t > s
 
 
@@ -76,7 +78,7 @@ def project(position: ti.template(), i, j, cols, uniforms: ti.template(), nodes:
         cols: number of columns of mass points.
         uniforms: constants of the view, as returned by `view_uniforms`.
         nodes: projected mass points, NODE_STRIDE numbers each, written.
-        double: whether `nodes` is f64; sums are then in a different order.
+        double: whether `nodes` is f64; the order of the sum differs.
     """
     entry = (i * cols + j) * NODE_STRIDE
     x, y, z = position[i, j, 0], position[i, j, 1], position[i, j, 2]
@@ -103,7 +105,7 @@ def w_at(depth, uniforms: ti.template()):
 
 @ti.func
 def line_of_sight(x, y, uniforms: ti.template()):
-    """Return the offsets of lines of sight from the optical axis at w = 1, to the right and up [m].
+    """Return the components of lines of sight to the right and up, at w = 1 [m].
 
     Args:
         x: undistorted columns [samples].
@@ -167,7 +169,12 @@ def cell_outline(corner, cols, near, nodes: ti.template()):
     x = [nodes[entry + SCREEN] for entry in corners]
     y = [nodes[entry + SCREEN + 1] for entry in corners]
     w = [nodes[entry + 2] for entry in corners]
-    facing = _facing_of(x, y)
+    # Twice the signed areas of the triangles of three corners, positive if clockwise in the picture.
+    turns = [
+        (x[m] - x[n]) * (y[k] - y[m]) - (y[m] - y[n]) * (x[k] - x[m])
+        for n, m, k in ti.static(((0, 1, 3), (1, 3, 2), (3, 2, 0), (2, 0, 1)))
+    ]
+    facing = ti.select(ti.min(*turns) > 0, 1.0, ti.select(ti.max(*turns) < 0, -1.0, 0.0))
     in_front = w[0] > near and w[1] > near and w[2] > near and w[3] > near
     behind = w[0] <= near and w[1] <= near and w[2] <= near and w[3] <= near
     left, right, top, bottom = ti.min(*x), ti.max(*x), ti.min(*y), ti.max(*y)
@@ -195,7 +202,7 @@ def cell_patch(corner, cols, facing, invertible, nodes: ti.template(), double: t
         facing: as in `Outline`.
         invertible: as in `Patch`.
         nodes: projected mass points.
-        double: whether `nodes` is f64; D is then summed in a different order.
+        double: whether `nodes` is f64; the order of the sum in D differs.
     """
     corners = ti.static(corner_entries(corner, cols, NODE_STRIDE))
     a, right, down, opposite = [ti.Vector([nodes[entry + n] for n in ti.static(range(4))]) for entry in corners]
@@ -206,9 +213,9 @@ def cell_patch(corner, cols, facing, invertible, nodes: ti.template(), double: t
 
 @ti.func
 def edge(p_x, p_y, q_x, q_y, x, y, facing):
-    """Return twice the signed area of the triangle p, q, (x, y); its sign tells the side of the line p q.
+    """Return twice the signed area of the triangle p, q, (x, y); the sign is the side of the line p q.
 
-    The two cells at an edge compute the same bits, up to the sign.
+    Both cells at an edge compute the same bits, up to the sign.
 
     Args:
         p_x: column of the line's first point [samples].
@@ -225,7 +232,7 @@ def edge(p_x, p_y, q_x, q_y, x, y, facing):
 
 @ti.func
 def edges(x, y, facing, outline: ti.template()):
-    """Return `edge` of the left, right, upper and lower edge of a cell; inside the cell all are 0 or more.
+    """Return `edge` of the left, right, upper and lower edge of a cell; all are 0 or more inside the cell.
 
     Args:
         x: undistorted columns [samples].
@@ -243,27 +250,17 @@ def edges(x, y, facing, outline: ti.template()):
 
 
 @ti.func
-def _facing_of(x: ti.template(), y: ti.template()):
-    """Return `facing` of a cell from lists of its corners' x and y; 0 if it is folded."""
-    # Twice the signed areas of the triangles of three corners, positive if clockwise in the picture.
-    turns = [
-        (x[m] - x[n]) * (y[k] - y[m]) - (y[m] - y[n]) * (x[k] - x[m])
-        for n, m, k in ti.static(((0, 1, 3), (1, 3, 2), (3, 2, 0), (2, 0, 1)))
-    ]
-    return ti.select(ti.min(*turns) > 0, 1.0, ti.select(ti.max(*turns) < 0, -1.0, 0.0))
-
-
-@ti.func
 def find_quads(x, y, inside, subdivisions, patch: ti.template()):
-    """Invert the bilinear map of a cell at samples: return the column and the row of their sub-quads.
+    """Return the column and the row of the sub-quads at samples, by inverting the bilinear map of their cell.
 
     Args:
         x: undistorted columns [samples].
         y: undistorted rows [samples].
-        inside: mask of the samples in the cell; the others are assigned sub-quad (0, 0).
+        inside: mask of the samples in the cell; the others have sub-quad (0, 0).
         subdivisions: sub-quads along a side of the cell.
         patch: bilinear surface of the cell.
     """
+    # The two equations are a_1 + b_1 s + c_1 t + d_1 s t = 0, and the same with 2.
     coefficients = ti.static((patch.a, patch.b, patch.c, patch.d))
     a_1, b_1, c_1, d_1 = [k[0] - x * k[2] for k in coefficients]
     a_2, b_2, c_2, d_2 = [k[1] - y * k[2] for k in coefficients]
@@ -293,39 +290,40 @@ def triangle_at(x, y, quad_column, quad_row, quad_side, lower, patch: ti.templat
         quad_column: column of the sub-quads in their cell, one per lane.
         quad_row: row of the sub-quads in their cell, one per lane.
         quad_side: side of the sub-quads, as a fraction of the cell's.
-        lower: whether the triangle is the one below the diagonal; used only if the cell is not invertible.
+        lower: whether the triangle is below the diagonal; used only unless the cell is invertible.
         patch: bilinear surface of the cell.
     """
     a, b, c, d = ti.static((patch.a, patch.b, patch.c, patch.d))
     s0 = quad_column * quad_side
     t0 = quad_row * quad_side
     p = [a[n] + b[n] * s0 + (c[n] + d[n] * s0) * t0 for n in ti.static(range(4))]
-    # The sub-quad is P + R s + Q t + twist s t.
-    r = [(b[n] + d[n] * t0) * quad_side for n in ti.static(range(4))]
-    q = [(c[n] + d[n] * s0) * quad_side for n in ti.static(range(4))]
+    # The sub-quad is P + right s + down t + twist s t; the diagonal ends at P + right + down + twist.
+    right = [(b[n] + d[n] * t0) * quad_side for n in ti.static(range(4))]
+    down = [(c[n] + d[n] * s0) * quad_side for n in ti.static(range(4))]
     twist = d * (quad_side * quad_side)
-    f_w = p[2] + r[2] + q[2] + twist[2]
+    end_w = p[2] + right[2] + down[2] + twist[2]
     below = (
-        (p[0] - x * p[2]) * (p[1] + r[1] + q[1] + twist[1] - y * f_w)
-        - (p[1] - y * p[2]) * (p[0] + r[0] + q[0] + twist[0] - x * f_w)
+        (p[0] - x * p[2]) * (p[1] + right[1] + down[1] + twist[1] - y * end_w)
+        - (p[1] - y * p[2]) * (p[0] + right[0] + down[0] + twist[0] - x * end_w)
     ) * patch.facing >= 0.0
     if not patch.invertible:
         below = lower
     for n in ti.static(range(4)):
-        r[n] = ti.select(below, r[n] + twist[n], r[n])
-        q[n] = ti.select(below, q[n], q[n] + twist[n])
-    return ti.static(Triangle(p, r, q, below))
+        right[n] = ti.select(below, right[n] + twist[n], right[n])
+        down[n] = ti.select(below, down[n], down[n] + twist[n])
+    return ti.static(Triangle(p, right, down, below))
 
 
 @ti.func
 def on_triangle(x, y, triangle: ti.template()):
-    """Return s and t on a triangle at samples.
+    """Return the coordinates s and t of samples on a triangle.
 
     Args:
         x: undistorted columns [samples].
         y: undistorted rows [samples].
-        triangle: drawn triangle P + R s + D t.
+        triangle: drawn triangle of a sub-quad.
     """
+    # The two equations are p_1 + r_1 s + d_1 t = 0, and the same with 2.
     coefficients = ti.static((triangle.p, triangle.r, triangle.d))
     p_1, r_1, d_1 = [k[0] - x * k[2] for k in coefficients]
     p_2, r_2, d_2 = [k[1] - y * k[2] for k in coefficients]
@@ -368,7 +366,7 @@ def depth_at(s, t, triangle: ti.template()):
 
 @ti.func
 def facet(x, y, triangle: ti.template(), uniforms: ti.template()):
-    """Return the normal of a triangle on its visible side, in OpenCV's axes; a list of three components, of any length.
+    """Return the normal of a triangle, on its visible side, of any length; a list in OpenCV's axes.
 
     Args:
         x: undistorted columns [samples].
@@ -406,14 +404,14 @@ def may_cover_rows(corner, distorted_entry, cols, top, bottom, uniforms: ti.temp
         nodes: projected mass points.
     """
     distorted_corners = ti.static(corner_entries(distorted_entry, cols, DISTORTED_STRIDE))
-    within = [nodes[entry + 2] for entry in distorted_corners]
+    valid = [nodes[entry + 2] for entry in distorted_corners]
     rows = [nodes[entry + 1] for entry in distorted_corners]
     corners = ti.static(corner_entries(corner, cols, NODE_STRIDE))
     x = [nodes[entry + SCREEN] for entry in corners]
     y = [nodes[entry + SCREEN + 1] for entry in corners]
     margin = uniforms[uni.SAGITTA_FACTOR] * lens_kernels.squared_length(x, y) + 2.0
-    partly_valid = within[0] + within[1] + within[2] + within[3] < 3.5
-    return partly_valid or (ti.max(*rows) + margin > top and ti.min(*rows) - margin < bottom)
+    is_partly_valid = valid[0] + valid[1] + valid[2] + valid[3] < 3.5
+    return is_partly_valid or (ti.max(*rows) + margin > top and ti.min(*rows) - margin < bottom)
 
 
 @ti.func
@@ -428,22 +426,21 @@ def distorted_cell_bounds(distorted_entry, cols, outline: ti.template(), uniform
         nodes: projected mass points.
     """
     corners = ti.static(corner_entries(distorted_entry, cols, DISTORTED_STRIDE))
-    within = nodes[corners[0] + 2] + nodes[corners[1] + 2] + nodes[corners[2] + 2] + nodes[corners[3] + 2] > 3.5
+    is_valid = nodes[corners[0] + 2] + nodes[corners[1] + 2] + nodes[corners[2] + 2] + nodes[corners[3] + 2] > 3.5
     distorted_x = [nodes[entry] for entry in corners]
     distorted_y = [nodes[entry + 1] for entry in corners]
-    return lens_kernels.distorted_bounds(outline.x, outline.y, distorted_x, distorted_y, within, uniforms)
+    return lens_kernels.distorted_bounds(outline.x, outline.y, distorted_x, distorted_y, is_valid, uniforms)
 
 
 @ti.func
 def is_off_screen(corners: ti.template(), left, right, top, bottom):
-    """Return whether a polygon, possibly partly behind the camera, is beyond an edge of the picture.
+    """Return whether a polygon is beyond an edge of the picture; parts of it may be behind the camera.
 
-    The right edge x of the picture is the plane X = x w, which also extends behind the camera. The polygon is beyond it
-    if X > x w at all corners; the other edges are alike.
+    The right edge x is the plane X = x w, which extends behind the camera: beyond it, X > x w at all corners.
 
     Args:
         corners: list of the corners, vectors (X, Y, w, ...).
-        left: left edge of the picture, without distortion [samples].
+        left: left edge of the picture, undistorted [samples].
         right: right edge [samples].
         top: upper edge [samples].
         bottom: lower edge [samples].
@@ -477,8 +474,8 @@ def triangle_bounds(
         lens: name of the lens model; empty without lens distortion.
 
     Returns:
-        Least and largest x, least and largest y [samples], the largest below the least for a triangle outside the
-        picture; and the enlargement that closes gaps, as a fraction of the triangle's side.
+        Least and largest x, least and largest y [samples], with largest below least outside the picture; the
+        enlargement that closes gaps, as a fraction of the triangle's side.
     """
     a, b, c, d = ti.static((patch.a, patch.b, patch.c, patch.d))
     low_x, high_x, low_y, high_y = 0.0, ti.cast(width, ti.f32), -INFINITY, INFINITY

@@ -1,9 +1,9 @@
 """Kernel 2 on a GPU: every mass point, cell, sample and pixel is a thread.
 
-A cell is one piece, or one piece per triangle if it is drawn triangle by triangle. A part is some consecutive pieces of
-a cell. Parts are listed in bins (bins.py), and each sample processes the list of its bin, in chunks that bound the time
-of a thread; the nearest surface is kept between launches. Then each pixel covers its samples with the instruments and
-shades them. The picture is drawn in strips of rows, with a thread per sample.
+A piece is an invertible cell, or a triangle of a cell that is not. A part is some consecutive pieces of a cell. Bins
+(bins.py) list the parts, and each sample processes the list of its bin, in chunks that bound the time of a thread; the
+nearest surface is kept between launches. Then each pixel covers its samples with the instruments and shades them. The
+picture is drawn in strips of rows, with a thread per sample.
 """
 
 from collections.abc import Callable
@@ -22,10 +22,10 @@ from taichi_msm.render.shading import resolve
 from taichi_msm.system.launches import VULKAN_THREADS, Launches, end_thread
 from taichi_msm.system.runtime import compilation_options, ti, write_vectors
 
-# Margin of bounding boxes for rounding and for the centres of samples [samples].
+# Margin of bounding boxes: for rounding, and for the offset of sample centres [samples].
 MARGIN = 1.5
 
-# Maximum number of parts; if there are more triangles, a part has several of them.
+# Maximum number of parts; a part has several pieces if there are more of them.
 MAX_PARTS = 1 << 22
 
 
@@ -55,7 +55,7 @@ class Threads:
         self._nodes = launches.array(np.float32, rows * cols * geometry.POINT_STRIDE)
         self._pieces = launches.array(np.int32, self._cells)
         strip = self._strip_rows * config.supersample * samples_across * config.planes
-        # With lens distortion the undistortion map comes before the strip.
+        # The undistortion map, empty without lens distortion; then the strip.
         self._samples = ti.ndarray(
             config.float_vector, height * config.supersample * samples_across * config.map_planes + strip
         )
@@ -103,7 +103,7 @@ class Threads:
         bins = build_bins(launches, bounds, parts, (samples_across, samples_down), bin_size)
         sizes[[uni.BIN_SIZE, uni.BINS_ACROSS]] = bins.size, bins.columns
         view_arrays = view_arrays[0], launches.upload(sizes)
-        # Iterations per sample: one per part, and three per triangle, for the triangle and its tiles.
+        # Iterations of a sample: one per part, and three per piece, for the piece and its tiles.
         rounds_of_part = 1 + 3 * pieces_per_part
         rounds_of_instruments = instruments * (1 + factor * (1 + factor))
         rounds_of_shading = factor * (1 + factor * (1 + int(sizes[uni.LEVEL_COUNT]) + instruments)) + 2
@@ -139,7 +139,7 @@ def _sheet_kernels(config: DrawingConfig) -> tuple[Callable[..., None], Callable
     ):  # fmt: skip
         """Project the mass points, and count the pieces of each cell.
 
-        A cell has one piece if it is inverted, one per triangle if not, and none behind the eye.
+        A cell has one piece if it is invertible, one per triangle if not, and none behind the eye.
 
         Args:
             position: positions of the mass points [m], shape (rows, cols, 3).
@@ -206,7 +206,7 @@ def _sheet_kernels(config: DrawingConfig) -> tuple[Callable[..., None], Callable
                         patch, uniforms, config.lens,
                     )  # fmt: skip
                     if not high_x < low_x:
-                        # With NaN bounds the triangle may be anywhere.
+                        # A triangle with NaN bounds may be anywhere.
                         if not (low_x <= high_x and low_y <= high_y):
                             low_x, high_x, low_y, high_y = -INFINITY, INFINITY, -INFINITY, INFINITY
                         left, right = ti.min(left, low_x), ti.max(right, high_x)
@@ -224,7 +224,7 @@ def _picture_kernels(config: DrawingConfig) -> tuple[Callable[..., None], Callab
 
     @ti.func
     def band_of(x, y, across, strip_row, picture: ti.template()):
-        """Return the band of `across` x `across` samples at column x and row y, in a strip from `strip_row` on."""
+        """Return the band of `across` x `across` samples at (x, y), in the strip that begins at row `strip_row`."""
         samples_of_map = picture.width * picture.height * config.map_planes
         first = samples_of_map + (y - strip_row) * picture.width * config.planes
         map_start = y * picture.width * config.map_planes

@@ -20,12 +20,11 @@ class Labels(NamedTuple):
         coordinates: coordinates of the material point, as fractions of the sheet's width from its left and of its
             height from its top, shape (height, width, 2); NaN where the sheet is not visible.
         depth: distance from the eye along the optical axis [m], shape (height, width); 0 where nothing is visible. The
-            orthographic camera's eye is above the sheet at rest by the length of its larger side; surfaces above the
-            eye have a negative depth.
+            height of the orthographic camera's eye is the sheet's larger side; surfaces above it have negative depth.
         instrument: 255 where an instrument is visible, else 0, shape (height, width).
         normals: unit normals of the drawn triangle or the instrument's surface, toward the camera, in OpenCV's axes (x
-            right, y down, z forward), shape (height, width, 3); NaN where nothing is visible. Shape (0, 0, 3) in the
-            outputs of a scene that does not request normals.
+            right, y down, z forward), shape (height, width, 3); NaN where nothing is visible. Shape (0, 0, 3) if the
+            scene does not request normals.
     """
 
     coordinates: NDArray[np.float32]
@@ -54,7 +53,7 @@ LABELS = {
 
 
 def requested_labels(outputs: Collection[str]) -> frozenset[str]:
-    """Return the names of the labels to write: all that are not optional, and the optional ones among the outputs."""
+    """Return the names of the labels to write: the optional ones only if they are among the outputs."""
     return frozenset(name for name, label in LABELS.items() if name in outputs or not label.is_optional)
 
 
@@ -72,19 +71,24 @@ def values_per_pixel(names: Collection[str]) -> int:
     return sum(len(LABELS[name].planes) for name in names)
 
 
-def label_channels(plane: Any, names: Collection[str]) -> list[tuple[int, int, int, int, Label]]:
-    """List the G-buffer planes that contain labels; a label without planes stays 0.
+class Channel(NamedTuple):
+    """Plane of the G-buffer with a value of a label."""
+
+    plane: int  # index of the plane
+    label: Label
+    offset: int  # of the label [values per pixel]
+    number: int  # of the value in the label
+
+
+def label_channels(plane: Any, names: Collection[str]) -> list[Channel]:
+    """Return the channels of labels; a label without planes has none, and is 0.
 
     Args:
         plane: index of each plane of the G-buffer, by name.
         names: names of the labels.
-
-    Returns:
-        For each plane: its index; the offset of its label [values per pixel]; its position in the label; the number of
-        planes of the label; the label.
     """
     return [
-        (getattr(plane, plane_name), offset, n, len(label.planes), label)
+        Channel(getattr(plane, plane_name), label, offset, n)
         for _, label, offset in _label_offsets(names)
         for n, plane_name in enumerate(label.planes)
         if hasattr(plane, plane_name)
@@ -124,13 +128,13 @@ class Flow(NamedTuple):
 
 
 class Stereo(NamedTuple):
-    """Labels of a stereo pair of cameras, in the first one's picture; None for those that were not requested.
+    """Labels of a stereo pair in the pixels of the first camera; None for those that were not requested.
 
     Attributes:
-        disparity: displacement to the left from the first to the second picture [px], shape (height, width); 0 where
+        disparity: displacement from the first to the second picture, to the left [px], shape (height, width); 0 where
             nothing is visible.
-        stereo: displacement to the right and down, likewise [px], shape (height, width, 2); NO_FLOW where nothing is
-            visible, and where the visible point is behind the second eye.
+        stereo: displacement from the first to the second picture, to the right and down [px], shape (height, width, 2);
+            NO_FLOW where nothing is visible, and where the visible point is behind the second eye.
         stereo_occlusion: 255 where the visible point is occluded in the second picture or outside it, else 0, shape
             (height, width).
     """
@@ -153,7 +157,7 @@ class Sight(NamedTuple):
 
 
 class FrameOutputs(NamedTuple):
-    """The outputs of one frame; None for those that were not requested."""
+    """Outputs of a frame; None for those that were not requested."""
 
     picture: NDArray[np.uint8] | None = None  # colours, shape (height, width, 3)
     labels: Labels | None = None

@@ -19,18 +19,18 @@ UNDISTORTION_TOLERANCE = 1e-11
 
 
 class Lens(NamedTuple):
-    """A lens distortion model and its coefficients."""
+    """A lens model and its coefficients."""
 
     model: str  # name of the model, a key of `lenses.MODELS`
-    coefficients: tuple[float, ...]  # all coefficients of the model, in its order
+    coefficients: tuple[float, ...]  # all coefficients, in the order of the model
 
     @property
     def limit(self) -> float:
-        """Largest valid radius r: the distortion folds back there, or the angle from the axis reaches 88 degrees."""
+        """Largest valid radius: there the distortion folds back, or the angle from the optical axis is 88 degrees."""
         return _limit(self)
 
     def distort(self, points: Array) -> Array:
-        """Return the distorted coordinates of normalised image coordinates, both of shape (..., 2)."""
+        """Distort normalised image coordinates, shape (..., 2); the result has the same shape."""
         distort = MODELS[self.model].build(NUMPY)
         return np.stack(distort(points[..., 0], points[..., 1], *self.coefficients), axis=-1)
 
@@ -51,7 +51,7 @@ class Lens(NamedTuple):
         if inverse is not None:
             return inverse
         limit = self.limit
-        # The limit itself is left out: it may be a pole.
+        # Without the limit, which may be a pole.
         radii = limit * np.sin(np.linspace(0, np.pi / 2, 4097)[:-1])
         radial = self._replace(coefficients=MODELS[self.model].without_tangential(self.coefficients))
         profile = radial.distort(np.stack([radii, 0 * radii], axis=-1))[..., 0]

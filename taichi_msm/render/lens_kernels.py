@@ -1,7 +1,7 @@
 """Lens distortion in kernels: distorted points, and bounding boxes of distorted cells and triangles.
 
-The formulas are those of `lenses`, the bounds those of `undistortion.VisibleRegion`. Undistorted points are pixels of
-the same camera without lens distortion, in [samples].
+The formulas are those of `lenses`, the bounds those of `undistortion.VisibleRegion`. Undistorted points are those
+of the same camera without lens distortion [samples].
 """
 
 from collections.abc import Callable
@@ -14,24 +14,20 @@ from taichi_msm.render import uniforms as uni
 from taichi_msm.render.undistortion import INVALID_COORDINATE
 from taichi_msm.system.runtime import ti
 
-# Numbers per distorted mass point: x and y [samples]; 1 if it is in front of the camera and within the limit of the
-# lens, else 0.
-DISTORTED_STRIDE = 3
-
-# The arctangent halves the angle HALVINGS times, and sums a power series in the remaining tangent. SERIES has the
-# divisors of its terms, smallest term first.
+# The arctangent halves the angle HALVINGS times, and sums the power series of the remaining angle, whose terms have the
+# divisors SERIES, smallest term first.
 HALVINGS = 3
 SERIES = [(-1.0) ** n * (2 * n + 1) for n in reversed(range(12))]
 
 
 @ti.func
 def _arctangent(tangent):
-    """Return the angle, 0 to pi / 2, of a tangent; GPUs have no arctangent in f64."""
+    """Return the angle of a tangent, 0 to pi / 2; GPUs have no arctangent in f64."""
     half_tangent = tangent
     for _ in ti.static(range(HALVINGS)):
         half_tangent = half_tangent / (1.0 + ti.sqrt(1.0 + half_tangent * half_tangent))
     square = half_tangent * half_tangent
-    # Derived from the argument for its precision: a quotient of constants would be f32.
+    # 1 and 0 in the precision of the argument; a quotient of constants would be f32.
     unit = half_tangent * 0.0 + 1.0
     total = half_tangent * 0.0
     for divisor in ti.static(SERIES):
@@ -47,7 +43,7 @@ def compile_lens(lens: str) -> Callable[..., Any]:
 
 @ti.func
 def distorted_point(x, y, uniforms: ti.template(), lens: ti.template()):
-    """Distort a point.
+    """Distort a point; a point beyond the limit of the lens is first moved to the limit.
 
     Args:
         x: undistorted column [samples].
@@ -56,8 +52,7 @@ def distorted_point(x, y, uniforms: ti.template(), lens: ti.template()):
         lens: name of the lens model.
 
     Returns:
-        x and y of the distorted point [samples], and whether the point is within the limit of the lens. A point beyond
-        it is first moved to the limit.
+        Distorted x and y [samples], and whether the point is within the limit of the lens.
     """
     a = (x - uniforms[uni.CENTRE_X]) * uniforms[uni.SPREAD_X]
     b = (y - uniforms[uni.CENTRE_Y]) * uniforms[uni.SPREAD_Y]
@@ -77,28 +72,12 @@ def distorted_point(x, y, uniforms: ti.template(), lens: ti.template()):
 
 
 @ti.func
-def store_distorted(distorted_entry, entry, uniforms: ti.template(), nodes: ti.template(), lens: ti.template()):
-    """Distort a projected mass point, and store it.
-
-    Args:
-        distorted_entry: first entry of the distorted mass point in `nodes`.
-        entry: first entry of the projected mass point in `nodes`.
-        uniforms: constants of the view, as returned by `view_uniforms`.
-        nodes: projected mass points, updated.
-        lens: name of the lens model.
-    """
-    x, y, is_valid = distorted_point(nodes[entry + uni.SCREEN], nodes[entry + uni.SCREEN + 1], uniforms, lens)
-    nodes[distorted_entry], nodes[distorted_entry + 1] = x, y
-    nodes[distorted_entry + 2] = ti.cast(is_valid and nodes[entry + 2] > uniforms[uni.NEAR], ti.f32)
-
-
-@ti.func
 def squared_length(x: ti.template(), y: ti.template()):
     """Return the squared length of the longest side of a triangle or a cell.
 
     Args:
-        x: list of the vertices' coordinates; of a cell its corners, row by row.
-        y: list of the vertices' coordinates, likewise.
+        x: list of the columns of the vertices; those of a cell row by row.
+        y: list of the rows of the vertices.
     """
     sides = ti.static(((0, 1), (1, 2), (2, 0)) if len(x) == 3 else ((0, 1), (1, 3), (3, 2), (2, 0)))
     squares = [(x[n] - x[m]) * (x[n] - x[m]) + (y[n] - y[m]) * (y[n] - y[m]) for n, m in sides]
@@ -121,7 +100,7 @@ def distorted_bounds(
         uniforms: constants of the view, as returned by `view_uniforms`.
 
     Returns:
-        Least and largest x, least and largest y [samples]; the largest are below the least outside the picture.
+        Least and largest x, least and largest y [samples], with largest below least outside the picture.
     """
     squared = squared_length(x, y)
     margin = ti.min(uniforms[uni.STRETCH_FACTOR] * ti.sqrt(squared), 1e6)

@@ -27,7 +27,7 @@ def drawing_warnings(scene: Scene) -> Iterator[str]:
     if scene.draws:
         yield from _stretched_picture(scene)
         if texture.is_see_through(scene):
-            yield (f"parts of the picture are transparent, and show render.background: {list(scene.render.background)}")
+            yield f"parts of the picture are transparent, and show render.background: {list(scene.render.background)}"
         if scene.render.light != Light() and scene.render.shading != "tissue":
             yield f"render.light has no effect with shading: {scene.render.shading}; take render.shading: tissue"
     if scene.renders:
@@ -61,7 +61,7 @@ def describe_cameras(scene: Scene) -> Iterator[str]:
 
 
 def _describe_lens(camera: Camera, view: View) -> str:
-    """Describe the lens model, the size, the fields of view with the distortion, and the coefficients."""
+    """Describe lens model, picture size, fields of view with distortion, and coefficients."""
     distortion = camera.distortion or Distortion()
     (x, y), (width, height) = view.centre, view.size
     edges = (view.undistort(np.array([[0, y], [width, y], [x, 0], [x, height]])) - view.centre) / view.scale
@@ -79,11 +79,11 @@ def _camera_key(name: str) -> str:
 
 
 def _invisible_sheet(scene: Scene) -> Iterator[str]:
-    """Warn of cameras in which the sheet at rest is invisible or tiny in all frames."""
+    """Warn of cameras that show nothing of the sheet at rest, or only a dot, in all frames."""
     rate = scene.time.frames_per_second
     for name in scene.render.all_cameras:
         camera = view_at(scene, 0.0, name)
-        # A sheet between 100 x 100 test pixels is only a dot, as from a camera with lengths in millimetres.
+        # A sheet between the 100 x 100 test pixels is only a dot, as with a camera in millimetres.
         centres = (np.arange(100) + 0.5) / 100
         pixels = camera.undistort(np.stack(np.meshgrid(*(centres * side for side in camera.size)), axis=-1))
         frames = range(scene.time.frames + 1 if is_moving(scene, name) else 1)
@@ -93,17 +93,17 @@ def _invisible_sheet(scene: Scene) -> Iterator[str]:
 
 
 def _is_visible(camera: View, pixels: NDArray[np.float64], size: tuple[float, float]) -> bool:
-    """Return whether any of the pixels [px], shape (..., 2), shows the sheet of a size (height, width) at rest."""
+    """Return whether any pixel [px], shape (..., 2), shows the sheet at rest, of `size` (height, width) [m]."""
     try:
         # The homography from the plane of the sheet to the picture, inverted.
         inverse = np.linalg.inv(camera.matrix[:3][:, [0, 1, 3]])
     except np.linalg.LinAlgError:
         return False
-    x, y, per_w = np.moveaxis(pixels @ inverse[:, :2].T + inverse[:, 2], -1, 0)
+    x, y, inverse_w = np.moveaxis(pixels @ inverse[:, :2].T + inverse[:, 2], -1, 0)
     height, width = size
     # Pixels without a line of sight are NaN, and compare false.
-    is_inside = (per_w > 0) & (np.abs(x) <= width / 2 * per_w) & (np.abs(y) <= height / 2 * per_w)
-    return bool((is_inside & (per_w * camera.near < 1)).any())
+    is_inside = (inverse_w > 0) & (np.abs(x) <= width / 2 * inverse_w) & (np.abs(y) <= height / 2 * inverse_w)
+    return bool((is_inside & (inverse_w * camera.near < 1)).any())
 
 
 def _stretched_picture(scene: Scene) -> Iterator[str]:
@@ -136,5 +136,5 @@ def _stretched_picture(scene: Scene) -> Iterator[str]:
 
 
 def _nearly_equal(value: float, expected: float) -> bool:
-    """Return whether two numbers differ by less than 2 %, as aspect ratios without visible stretching."""
+    """Return whether numbers differ by less than 2 %; such stretching is invisible."""
     return expected / 1.02 < value < expected * 1.02

@@ -17,8 +17,8 @@ Pair = tuple[float, float]
 def pick(position: NDArray[np.floating], refine: int, view: View, pixel: Pair) -> Pair | None:
     """Return the material point at the centre of a pixel, on the nearest triangle there.
 
-    A point (X, Y, w, depth) of the camera projects to (x, y) if a = X - x w and b = Y - y w are 0. Both are linear in
-    the point, and need no division by w, which is 0 or negative behind the camera.
+    A point (X, Y, w, depth) projects to (x, y) if a = X - x w and b = Y - y w are 0. Both are linear, and need no
+    division by w, which is 0 or negative behind the camera.
 
     Args:
         position: positions of the mass points [m], shape (rows, cols, 3).
@@ -27,7 +27,7 @@ def pick(position: NDArray[np.floating], refine: int, view: View, pixel: Pair) -
         pixel: column and row, counted from (0, 0).
 
     Returns:
-        Fractions of the sheet's width from its left and of its height from its top; None if there is no surface.
+        Fractions of the sheet's width from its left and of its height from its top; None without a surface.
     """
     rows, cols = position.shape[:2]
     ray = view.centred_at(pixel)
@@ -66,7 +66,7 @@ def _cells_on_ray(position: NDArray[np.floating], ray: View) -> NDArray[np.bool_
     rows, cols = position.shape[:2]
     is_candidate = np.ones((rows - 1, cols - 1), dtype=bool)
     for row in ray.matrix[:2]:
-        # One coordinate at a time fits into the cache, also of large sheets.
+        # Only one coordinate of a large sheet fits into the cache.
         value = position @ row[:3] + row[3]
         for half in (value <= 0, value >= 0):
             rows_of_cells = half[:-1] | half[1:]
@@ -77,7 +77,7 @@ def _cells_on_ray(position: NDArray[np.floating], ray: View) -> NDArray[np.bool_
 def _hits_in_cells(
     corners: Array, i: NDArray[np.intp], j: NDArray[np.intp], refine: int, near: float
 ) -> list[tuple[float, Pair]]:
-    """List depth [m] and position (column, row) on the sheet [cells] of the hits in some cells."""
+    """Return the depth [m] and the position (column, row) on the sheet [cells] of each hit in some cells."""
     subdivisions = refine + 1
     fractions = np.arange(subdivisions + 1) / subdivisions
     s, t = fractions[:, None], fractions[:, None, None]

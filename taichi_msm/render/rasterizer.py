@@ -1,9 +1,9 @@
 """Kernel 2: bilinear subdivision, projection, rasterisation of textured triangles, shading.
 
-For each sample of the picture it computes the visible surface: the sheet, or an instrument in front of it
-(coverage.py). From this it writes the colours of pixels, their labels, or both (shading.py). Samples are divided among
-the workers of a CPU in bands (cpu.py), and are threads of a GPU (gpu.py). As in kernel 1, vectors remain vectors down
-to the machine code (docs/decisions/0010): hence the unusual casts, floors and absolute values of vectors.
+The kernel computes the visible surface of each sample, the sheet or an instrument in front of it (coverage.py), and
+writes the colours of pixels, their labels, or both (shading.py). On a CPU, bands of samples are divided among the
+workers (cpu.py); on a GPU, every sample is a thread (gpu.py). As in kernel 1, vectors remain vectors down to the
+machine code (docs/decisions/0010): hence the unusual casts, floors and absolute values of vectors.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ def drawing_config(
     Args:
         scene: scene with the settings of rendering.
         picture: whether colours are drawn.
-        labels: names of the labels that are written; with a picture, they require one sample per pixel.
+        labels: names of the labels that are written; together with a picture, only for one sample per pixel.
         lens: lens model of the camera, as `View.lens_model`; by default that of the scene's main camera.
     """
     render = scene.render

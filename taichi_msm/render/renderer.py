@@ -29,7 +29,7 @@ Array = NDArray[Any]
 
 
 class Shot(NamedTuple):
-    """State of the sheet and the instruments at a time, and the camera."""
+    """Sheet, camera and instruments at a time."""
 
     positions: Array  # of the mass points [m], shape (rows, cols, 3)
     view: View
@@ -110,7 +110,7 @@ class Renderer:
         return self._key(style, picture=True, camera=camera) in self._rasterizers
 
     def kernels(self) -> tuple[object, ...]:
-        """Return all compile-time settings of the kernels of `observe`, as a cache key."""
+        """Return the compile-time settings of all kernels of `observe`, as a cache key."""
         from taichi_msm.render.rasterizer import drawing_config
 
         scene, lenses = self.scene, [view.lens_model for view in self._views.values()]
@@ -177,7 +177,7 @@ class Renderer:
             The outputs of the frame.
         """
         scene = self.scene
-        # Labels require a sample at the centre of each pixel, which supersampling does not have.
+        # Labels require a sample at the centre of each pixel; supersampling has none there.
         is_single_sample = scene.render.supersample == 1
         requested = requested_labels(scene.output)
         observed = FrameOutputs()
@@ -226,7 +226,7 @@ class Renderer:
         return self._rasterizers[key]
 
     def _key(self, style: Render, *, picture: bool, labels: Collection[str] = (), camera: View) -> tuple[object, ...]:
-        """Return the cache key of a rasteriser: all settings in which those of this scene differ."""
+        """Return the cache key of a rasteriser: all settings that differ among the rasterisers of a scene."""
         return picture, frozenset(labels), camera.optics, style.shading, style.wireframe, self.scene.shapes
 
     def _texture(self) -> NDArray[np.uint8]:

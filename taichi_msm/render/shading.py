@@ -1,6 +1,6 @@
 """Shading: texture filtering and lighting of samples, then the colours and labels of pixels.
 
-Wet tissue and metal have the light of an endoscope: next to the main camera, and weaker with distance.
+The light on wet tissue and metal is that of an endoscope: next to the main camera, and weaker with distance.
 
 All vectors are in the camera's frame: the eye at 0, x right, y up, z toward the camera. P is the surface point of a
 sample, N its normal on the camera's side, L the unit vector from P to the light, V that from P to the eye, and
@@ -11,7 +11,7 @@ M = 2 (N L) N - L the direction of ideal reflection of the light:
     colour   = texture light + 255 gloss (M V)^shininess d0 / d
 
 d is the distance of P from the light, d0 that of the main camera's target, and diffuse0 the diffuse light at the
-target, on a sheet that faces the camera: there the sheet keeps its colours. Wrapped diffuse light approximates
+target on a sheet that faces the camera. There the colours are those of the texture. Wrapped diffuse light approximates
 scattering in tissue: no side of a dent is black. An instrument shades the tissue near it: at r radii from its axis, it
 removes the share uniforms.SHADE / r^2 of the light.
 
@@ -30,7 +30,7 @@ from taichi_msm.system.runtime import ti
 
 @ti.func
 def _shade(entry, left, top, texels: ti.template(), band: ti.template()):
-    """Shade a tile: light the texture, then draw the mesh and the instruments; return the colour."""
+    """Return the colour of a tile: the lit texture, with the mesh and the instruments drawn over it."""
     config, samples, uniforms = ti.static((band.config, band.samples, band.uniforms))
     plane = ti.static(config.plane)
     depth = samples[entry + plane.depth]
@@ -63,7 +63,7 @@ def _shade(entry, left, top, texels: ti.template(), band: ti.template()):
 
 @ti.func
 def _write_colours(colour: ti.template(), row, end_row, tile, colours: ti.template(), band: ti.template()):
-    """Write the colours of a tile, without supersampling; `tile` is its column."""
+    """Write the colours of a tile without supersampling; `tile` is its index in the row."""
     packed = ti.floor(colour[0] + 0.5) + ti.floor(colour[1] + 0.5) * 256.0 + ti.floor(colour[2] + 0.5) * 65536.0
     width = ti.static(band.config.tile_width)
     for tile_line in ti.static(range(band.config.tile_height)):
@@ -108,16 +108,20 @@ def _write_labels(entry, left, row, end_row, labels: ti.template(), band: ti.tem
     if ti.static(len(config.shapes) > 0):
         is_sheet = is_sheet & (samples[entry + plane.instrument] <= 0.0)
     values = [
-        ti.select(is_sheet if ti.static(label.sheet_only) else is_covered, samples[entry + vector], label.missing_value)
-        for vector, _offset, _number, _count, label in ti.static(channels)
+        ti.select(
+            is_sheet if ti.static(channel.label.sheet_only) else is_covered,
+            samples[entry + channel.plane],
+            channel.label.missing_value,
+        )
+        for channel in ti.static(channels)
     ]
     for line in ti.static(range(config.tile_height)):
         for n in ti.static(range(config.tile_width)):
             if row + line < end_row and left + n < band.width:
                 pixel = (row + line) * band.width + left + n
                 for channel, value in ti.static(zip(channels, values, strict=True)):
-                    _, first, number, count = ti.static(channel[:4])
-                    index = first * band.width * band.height + count * pixel + number
+                    count = ti.static(len(channel.label.planes))
+                    index = channel.offset * band.width * band.height + count * pixel + channel.number
                     labels[index] = value[line * config.tile_width + n]
 
 
@@ -159,13 +163,13 @@ def resolve(
 
 @ti.func
 def _illuminate(x, y, depth, normal: ti.template(), uniforms: ti.template()):
-    """Return N L, M V and d0 / d (see above), and the upward component of the reflected line of sight."""
+    """Return N L, M V, d0 / d at most 4, and the upward component of the reflected line of sight."""
     offset_x, offset_y = line_of_sight(x, y, uniforms)
     w = w_at(depth, uniforms)
     right, up = offset_x * w, offset_y * w
     light = [uniforms[uni.LIGHT_X] - right, uniforms[uni.LIGHT_Y] - up, uniforms[uni.LIGHT_Z] + depth]
     eye = [right * (uniforms[uni.PINHOLE] * (-1.0)), up * (uniforms[uni.PINHOLE] * (-1.0)), w]
-    # Scalar products before normalisation.
+    # Scalar products of vectors of any length.
     n_l, n_v, l_v = dot(normal, light), dot(normal, eye), dot(light, eye)
     n_n, l_l, v_v = [ti.max(dot(vector, vector), 1e-30) for vector in ti.static((normal, light, eye))]
     inverse_n_n = 1.0 / n_n
@@ -216,6 +220,7 @@ def _apply_relief(normal: ti.template(), slope_x, slope_y, uniforms: ti.template
     a, b = triple(uniforms, uni.ACROSS), triple(uniforms, uni.UP)
     n = [normal[k] * length for k in ti.static(range(3))]
     relief_x, relief_y = slope_x * uniforms[uni.SLOPE_X], slope_y * uniforms[uni.SLOPE_Y]
+    # Subtract from n the tangential part of the gradient, relief_x a + relief_y b.
     projection = relief_x * dot(a, n) + relief_y * dot(b, n)
     for k in ti.static(range(3)):
         normal[k] = n[k] * (projection + 1.0) - relief_x * a[k] - relief_y * b[k]
@@ -223,9 +228,9 @@ def _apply_relief(normal: ti.template(), slope_x, slope_y, uniforms: ti.template
 
 @ti.func
 def _light_tissue(x, y, depth, normal: ti.template(), slope_x, slope_y, column, row, band: ti.template()):
-    """Return the factor of the colours of wet tissue, and the gloss that is added to them, 0 to 255.
+    """Return the factor of the texture's colours, and the gloss that is added to the product, in grey levels.
 
-    The samples are at `column` and `row` of the picture.
+    `column` and `row` are the distorted positions of the samples in the picture.
     """
     config, uniforms = ti.static((band.config, band.uniforms))
     tilted = [normal[n] for n in ti.static(range(3))]
@@ -251,7 +256,7 @@ def _light_tissue(x, y, depth, normal: ti.template(), slope_x, slope_y, column, 
 @ti.func
 def _light_metal(x, y, depth, normal: ti.template(), uniforms: ti.template()):
     """Return the colour of metal, which reflects a room with a bright ceiling and a dark floor."""
-    # Metal at the light or behind it is lit as if in front of it.
+    # Metal next to the light or behind it is lit as if at the minimum depth.
     lit_depth = ti.max(depth, uni.METAL_NEAREST * uniforms[uni.LIGHT_DISTANCE])
     cosine, mirror, _, upward = _illuminate(x, y, lit_depth, normal, uniforms)
     brightness = ti.max(upward, 0.0)
@@ -287,13 +292,13 @@ def pyramid(texture: NDArray[np.uint8], *, minified: bool) -> tuple[NDArray[np.f
 
 @ti.func
 def _to_integers(values, config: ti.template()):
-    """Convert to integers, lane by lane, because casting a vector crashes."""
+    """Convert to integers, lane by lane: a cast of a vector crashes."""
     return config.integer_vector([ti.cast(values[lane], ti.i32) for lane in ti.static(range(config.lanes))])
 
 
 @ti.func
 def _fetch_rgb(index, texels: ti.template(), config: ti.template()):
-    """Gather the texels at some indices; return their colours."""
+    """Return the colours of the texels at indices, one per lane."""
     texel = config.float_vector([texels[index[lane]] for lane in ti.static(range(config.lanes))])
     blue = ti.floor(texel * (1.0 / 65536.0))
     remainder = texel - blue * 65536.0
@@ -311,12 +316,11 @@ def _bilinear(upper_left, upper_right, lower_left, lower_right, u, v):
 
 @ti.func
 def _fetch(first, width, height, x, y, texels: ti.template(), config: ti.template()):
-    """Filter a level of the texture bilinearly: return its colour, and with a relief the gradient of the grey level.
+    """Interpolate a level, `width` x `height` texels from `first` on, bilinearly at column x and row y.
 
-    The level has `width` x `height` texels from `first` on; `x` and `y` are column and row in it. The gradient is
-    positive to the right and down [1/texel].
+    Return the colour; with a relief, also the gradient of the grey level, to the right and down [1/texel].
     """
-    # Beyond the centres of its outermost texels the texture is constant.
+    # The texture is constant beyond the centres of its outermost texels.
     texel_x = ti.max(ti.min(x, width - 1.0), 0.0)
     texel_y = ti.max(ti.min(y, height - 1.0), 0.0)
     floor_x, floor_y = ti.floor(texel_x), ti.floor(texel_y)
@@ -338,7 +342,7 @@ def _fetch(first, width, height, x, y, texels: ti.template(), config: ti.templat
 
 @ti.func
 def _filter_texture(entry, is_covered, texels: ti.template(), band: ti.template()):
-    """Filter the texture, as `_fetch`, for the samples of a tile in the mask `is_covered`."""
+    """Return the colour of the texture at the covered samples of a tile, and its gradient, as `_fetch`."""
     config, sizes, samples = ti.static((band.config, band.sizes, band.samples))
     float_vector, integer_vector, plane = ti.static((config.float_vector, config.integer_vector, config.plane))
     x = ti.select(is_covered, samples[entry + plane.texel_x], 0.0)
@@ -354,8 +358,8 @@ def _filter_texture(entry, is_covered, texels: ti.template(), band: ti.template(
         footprint = ti.select(is_covered, samples[entry + plane.footprint], 0.0)
         max_footprint = footprint.max()
         if max_footprint > 1.0:
-            # For every sample, choose the coarsest level with texels no larger than the sample, and blend it with the
-            # next coarser one.
+            # For every sample, choose the coarsest level with texels no larger than the sample; below, the colour is
+            # blended with that of the next coarser level.
             last_level = sizes[uni.LEVEL_COUNT] - 1
             level, bound = 0, 1.0
             while level <= last_level and max_footprint >= bound:
@@ -377,6 +381,7 @@ def _filter_texture(entry, is_covered, texels: ti.template(), band: ti.template(
     colour, slope_x, slope_y = _fetch(first, width, height, x, y, texels, config)
     if ti.static(config.tissue):  # noqa: SIM102  (evaluated at compile time)
         if max_footprint > 1.0:
+            # The same position in the next coarser level.
             x = x * 0.5 - 0.25
             y = y * 0.5 - 0.25
             coarse_colour, coarse_slope_x, coarse_slope_y = _fetch(

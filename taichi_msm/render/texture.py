@@ -41,7 +41,7 @@ def load_texture(scene: Scene, sha256: str | None = None) -> NDArray[np.uint8]:
 
 
 def require_texture(texture: Any) -> NDArray[np.uint8]:
-    """Return an argument as a texture, shape (height, width, 3); raise an ArgumentError if it is not one."""
+    """Return an argument as a texture, shape (height, width, 3), or raise an ArgumentError."""
     picture = as_array(texture, "texture")
     is_picture = picture.dtype == np.uint8 and picture.ndim == 3 and picture.shape[2] == 3
     if not (is_picture and min(picture.shape) > 0 and max(picture.shape) <= MAX_SIDE_PX):

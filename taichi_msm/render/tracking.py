@@ -1,7 +1,7 @@
 """Pixels and occlusion of material points, computed in f64 without a depth map.
 
 A material point is located on the drawn triangles, and projected. It is occluded if another part of the surface or an
-instrument is nearer on the same line of sight. Bins list the cells that may be on it.
+instrument is nearer on its line of sight. Bins list the cells on which that part may be.
 """
 
 import math
@@ -28,17 +28,16 @@ from taichi_msm.system.runtime import compilation_options, lanes, ti
 
 Array = NDArray[Any]
 
-# Offsets in the numbers of a cell: its bounds in the picture [px]; its least depth [m]; and `facing`, 0 if it is drawn
-# triangle by triangle.
+# Layout of `outlines`: for every cell its bounds in the picture [px]; its least depth [m]; `facing`, 0 if the cell is
+# drawn triangle by triangle.
 CELL_MIN_X, CELL_MAX_X, CELL_MIN_Y, CELL_MAX_Y, CELL_MIN_DEPTH, CELL_FACING, CELL_STRIDE = range(7)
 
 # Bounds of a cell that may be anywhere [px].
 UNBOUNDED = 1e9
 
-# Number of cells around a mass point.
-CELLS_AROUND_NODE = 4
+CELLS_AROUND_POINT = 4
 
-# Pixel coordinate of points that have no projection.
+# Pixel coordinate of points without a projection.
 NOT_VISIBLE = math.nan
 
 
@@ -90,7 +89,7 @@ def compute_flow(
 def compute_stereo(
     scene: Scene, labels: Labels, position: Array, view: View, instruments: Sequence[Solid] = ()
 ) -> Flow:
-    """Compute the flow from a camera's picture to that of its companion at the same time, also of instruments.
+    """Compute the flow of the sheet and the instruments from a camera's picture to its companion's at the same time.
 
     Args:
         scene: scene with the sheet and the size of the picture.
@@ -114,7 +113,7 @@ def compute_stereo(
         centres = instrument_pixels[:, ::-1].astype(np.float64) + 0.5
         pixels = view.undistort(centres)
         depth = _instrument_depth(scene, pixels, view, instruments)
-        # By rounding to f32, an instrument may cover a pixel just outside its outline.
+        # Pixels just outside an instrument's outline may show it, by rounding to f32.
         depth = np.where(depth < INFINITY, depth, labels.depth[y, x])
         companion_pixels, hidden = _track(
             scene, view.points(pixels, depth), position, companion, instruments, as_flow=False
@@ -140,10 +139,10 @@ def _instrument_depth(scene: Scene, pixels: Array, view: View, instruments: Sequ
 def _track(
     scene: Scene, points: Array, position: Array, view: View, instruments: Sequence[Solid], *, as_flow: bool
 ) -> tuple[NDArray[np.float32], NDArray[np.uint8]]:
-    """Return the pixels of points, or their flow, and their occlusion.
+    """Return the pixels of points, or with `as_flow` their flow, and their occlusion.
 
-    The points are coordinates of material points, shape (n, 2), or points of instruments [m], shape (n, 3). With
-    `as_flow`, they are the points at all pixels of another frame, row by row; the flow of each starts at its pixel.
+    The points are coordinates of material points, shape (n, 2), or points of instruments [m], shape (n, 3). For the
+    flow from another frame, they are those at the centres of its pixels, row by row.
     """
     total, is_material = len(points), points.shape[-1] == 2
     if total == 0:
@@ -154,7 +153,7 @@ def _track(
     undistorted = view if view.lens is None else undistorted_view(view)
     points = np.asarray(points, np.float32) if is_material else undistorted.project(points)
     width, height = (int(side) for side in undistorted.size)
-    # With bins half as wide as cells, most bins only overlap the cells around one mass point.
+    # Bins half as wide as cells: most of them overlap only the cells around one mass point.
     bin_size = max(4, round((width * height / cells) ** 0.5 / 2))
     launches = Launches(bounded=lanes("f64") == 1)
     uniform_values = uni.view_uniforms(undistorted, scene, instruments)
@@ -174,7 +173,7 @@ def _track(
     is_simple = launches.array(np.uint8, bins.lengths.size)
     launches.launch(
         _mark_simple_bins, bins.lengths.size, outlines, cols, bins.starts, bins.entries, is_simple,
-        rounds=3 * CELLS_AROUND_NODE,
+        rounds=3 * CELLS_AROUND_POINT,
     )  # fmt: skip
     pixels, hidden = launches.array(np.float32, 2 * total), launches.array(np.uint8, total)
     arguments = (
@@ -231,32 +230,32 @@ def _mark_simple_bins(
 ):  # fmt: skip
     """Mark the bins in which no two cells overlap.
 
-    Such a bin has only cells around one mass point, all of them invertible and facing the same way. Each cell is
-    convex, so it is within the angle between its two edges at the mass point, and these angles add up to 360 degrees.
+    Such a bin has only cells around one mass point, all invertible and with equal `facing`. A cell is convex, so it is
+    within the angle between its two edges at the mass point, and these angles add up to 360 degrees.
     """
     for bin_index in range(first, end):
         first_i, last_i, first_j, last_j = 1 << 30, -1, 1 << 30, -1
         length = starts[bin_index + 1] - starts[bin_index]
-        for n in range(starts[bin_index], starts[bin_index] + ti.min(length, CELLS_AROUND_NODE)):
+        for n in range(starts[bin_index], starts[bin_index] + ti.min(length, CELLS_AROUND_POINT)):
             i, j = entries[n] // (cols - 1), entries[n] % (cols - 1)
             first_i, last_i = ti.min(first_i, i), ti.max(last_i, i)
             first_j, last_j = ti.min(first_j, j), ti.max(last_j, j)
-        around_node = length <= CELLS_AROUND_NODE and last_i - first_i <= 1 and last_j - first_j <= 1
-        if around_node:
+        around_point = length <= CELLS_AROUND_POINT and last_i - first_i <= 1 and last_j - first_j <= 1
+        if around_point:
             facing_sum, count = 0.0, 0.0
-            # Cells that do not overlap the bin are checked, too.
+            # Also with cells that do not overlap the bin.
             for i in range(first_i, last_i + 1):
                 for j in range(first_j, last_j + 1):
                     facing_sum += outlines[(i * (cols - 1) + j) * CELL_STRIDE + CELL_FACING]
                     count += 1.0
-            around_node = abs(facing_sum) == count
-        is_simple[bin_index] = ti.cast(around_node, ti.u8)
+            around_point = abs(facing_sum) == count
+        is_simple[bin_index] = ti.cast(around_point, ti.u8)
         end_thread(ended)
 
 
 @ti.func
 def _quad_depth(x, y, quad_column, quad_row, quad_side, lower, near, patch: ti.template()):
-    """Return the depth of a sub-quad of a cell at (x, y), or INFINITY."""
+    """Return the depth of a sub-quad of a cell at (x, y); INFINITY if its triangle is not there."""
     triangle = ti.static(geometry.triangle_at(x, y, quad_column, quad_row, quad_side, lower, patch))
     s, t = geometry.on_triangle(x, y, triangle)
     depth = geometry.depth_at(s, t, triangle)
@@ -268,7 +267,7 @@ def _cell_occludes(
     x, y, depth, index, point_cell, point_triangle, cols, subdivisions, near,
     nodes: ti.template(), outlines: ti.template(),
 ):  # fmt: skip
-    """Return whether a cell occludes a point at (x, y) and `depth` on the triangle `point_triangle` of `point_cell`."""
+    """Return whether a cell occludes a point at (x, y) and `depth`, which is on `point_triangle` of `point_cell`."""
     entry, quad_side = index * CELL_STRIDE, 1.0 / subdivisions
     facing = outlines[entry + CELL_FACING]
     invertible = facing != 0.0
@@ -374,7 +373,7 @@ def _instrument_point(entry, points: ti.template(), _sizes: ti.template(), _subd
 
 @cache
 def _kernel(lens: str, shapes: tuple[str, ...], is_material: bool) -> Callable[..., None]:
-    """Return the kernel that locates material points of the sheet, or points of instruments."""
+    """Return the kernel that locates material points, or points of instruments."""
     Points: Any = Floats if is_material else Doubles
     locate, stride, limit = (_material_point, 2, 2.0) if is_material else (_instrument_point, 4, INFINITY)
 
@@ -392,10 +391,10 @@ def _kernel(lens: str, shapes: tuple[str, ...], is_material: bool) -> Callable[.
             ended: counter of finished threads, for `end_thread`.
             chunk_start: position of the first cell of the chunk in each list.
             chunk_size: number of cells of the chunk.
-            points: coordinates of material points on the sheet, shape (2 * n,); of instruments X, Y, w and depth of
-                points, shape (4 * n,).
-            as_flow: 0 for pixels; 1 for displacements, where point k starts at the centre of pixel k of another frame.
-            uniforms: constants of the view without distortion, and the lens.
+            points: coordinates of material points, shape (2 * n,); or X, Y, w and depth of points of instruments,
+                shape (4 * n,).
+            as_flow: 0 for pixels; 1 for displacements of points k from the centres of pixels k of another frame.
+            uniforms: constants of the undistorted view, and the lens.
             sizes: sizes and counters, as returned by `sizes_of`.
             nodes: projected mass points, NODE_STRIDE numbers each.
             outlines: outlines of the cells, CELL_STRIDE numbers each.
@@ -409,7 +408,7 @@ def _kernel(lens: str, shapes: tuple[str, ...], is_material: bool) -> Callable[.
             cols, width, height = sizes[uni.COLS], sizes[uni.WIDTH], sizes[uni.HEIGHT]
             near, subdivisions = uniforms[uni.NEAR], uniforms[uni.SUBDIVISIONS]
             x, y, is_hidden = ti.cast(NOT_VISIBLE, ti.f64), ti.cast(NOT_VISIBLE, ti.f64), False
-            if abs(points[stride * k]) < limit:  # False for NaN
+            if abs(points[stride * k]) < limit:  # false for NaN
                 p_x, p_y, w, p_depth, point_cell, point_triangle = locate(
                     stride * k, points, sizes, subdivisions, nodes
                 )
@@ -439,7 +438,7 @@ def _kernel(lens: str, shapes: tuple[str, ...], is_material: bool) -> Callable[.
                     if not is_valid:
                         x, y = ti.cast(NOT_VISIBLE, ti.f64), ti.cast(NOT_VISIBLE, ti.f64)
             if as_flow > 0:
-                is_visible = x > -INFINITY  # False for NaN
+                is_visible = x > -INFINITY  # false for NaN
                 x = ti.select(is_visible, x - ti.cast(k % width, ti.f64) - 0.5, NO_FLOW)
                 y = ti.select(is_visible, y - ti.cast(k // width, ti.f64) - 0.5, NO_FLOW)
             pixels[2 * k] = ti.cast(x, ti.f32)

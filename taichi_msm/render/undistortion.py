@@ -1,6 +1,6 @@
 """Undistortion maps: undistorted positions of the samples of a picture, computed once per lens and picture size.
 
-The map, and bounds of the distortion of a cell, let kernel 2 cover distorted pictures like undistorted ones.
+With the map, and with bounds of the distortion of a cell, kernel 2 covers distorted pictures like undistorted ones.
 """
 
 from __future__ import annotations
@@ -17,12 +17,12 @@ from taichi_msm.render.lens import Lens
 Array = NDArray[np.float64]
 Pair = tuple[float, float]
 
-# Undistorted coordinate of samples beyond the limit of the lens.
+# Undistorted coordinate of a sample beyond the limit of the lens.
 INVALID_COORDINATE = 1e9
 
 
 class VisibleRegion(NamedTuple):
-    """Visible region of the plane at depth 1, with bounds of the lens distortion in it.
+    """Visible region of the plane at depth 1, and bounds of the lens distortion in it.
 
     Distortion bends a line of length L into a curve at most `sagitta_factor` L^2 from its chord: the second derivatives
     are at most 8 `sagitta_factor`. The length of the curve is at most 2 `stretch_factor` L.
@@ -31,7 +31,7 @@ class VisibleRegion(NamedTuple):
     radius: float  # largest distance from the optical axis, in normalised image coordinates
     box: tuple[float, float, float, float]  # left, right, top and bottom without distortion [px]
     sagitta_factor: float  # [1/px]
-    stretch_factor: float  # without unit
+    stretch_factor: float  # [1]
 
 
 def visible_region(view: View) -> VisibleRegion:
@@ -48,9 +48,9 @@ def _visible_region(lens: Lens, scale: Pair, centre: Pair, size: Pair) -> Visibl
     if np.isnan(radius):
         radius = lens.limit
         border = np.array([[-radius, -radius], [radius, radius]])
-    # With a margin of one pixel, the sampling distance of the border.
+    # The margin of one pixel is the spacing of the border points.
     (left, top), (right, bottom) = border.min(axis=0) * scale + centre - 1, border.max(axis=0) * scale + centre + 1
-    # Bounds of the derivatives: their maximum on a polar grid, with a safety factor.
+    # The derivatives are bounded by their maximum on a polar grid, with a safety factor.
     radii, angles = np.meshgrid(radius * np.linspace(0, 1, 256), np.linspace(0, 2 * np.pi, 64))
     points = np.stack([radii * np.cos(angles), radii * np.sin(angles)], axis=-1)
     step = 1e-5 * radius
@@ -89,8 +89,8 @@ def undistortion_map(view: View, supersample: int, *, with_steps: bool) -> NDArr
         with_steps: whether the steps to the next samples are included.
 
     Returns:
-        x and y [samples], INVALID_COORDINATE beyond the limit of the lens, shape (rows, columns, 2). With steps, shape
-        (rows, columns, 6): also x and y of the step to the right sample, and x and y of the step to the lower one.
+        x and y [samples], INVALID_COORDINATE beyond the limit of the lens, shape (rows, columns, 2). With steps, also x
+        and y of the step to the sample on the right and x and y of that to the sample below, shape (rows, columns, 6).
     """
     assert view.lens is not None
     width, height = (int(side) * supersample for side in view.size)

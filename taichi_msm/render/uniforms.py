@@ -23,31 +23,30 @@ WIRE_COLOUR = (235, 245, 255)
 WIRE_WIDTH = 1.0
 WIRE_OPACITY = 0.75
 
-# Largest size of a sample on the texture that is filtered at full resolution [texels]; the bilinear filter spans two.
+# Largest size on the texture of a sample that needs no mipmap [texels]; the bilinear filter spans two.
 FULL_RESOLUTION_TEXELS = 2.0
 
 # Offset of the light from the eye, to the right and up, as a fraction of the distance to the target.
 LIGHT_RIGHT, LIGHT_UP = -0.3, 0.0
 
-# Wrap of diffuse light; logarithm of the shininess of highlights, 2^SHARPNESS (shading.py).
+# Wrap of diffuse light; binary logarithm of the shininess of highlights (shading.py).
 WRAP = 0.3
 SHARPNESS = 3
 
 # Share of the light that an instrument removes from the tissue that it touches.
 SHADE = 0.7
 
-# Metal: colour; shares of ambient light, diffuse light and the reflected room; brightness of the highlight, 1 is white.
+# Metal: colour; shares of ambient light, diffuse light and the reflected room; brightness of the highlight, white at 1.
 METAL = (176.0, 182.0, 190.0)
 METAL_AMBIENT, METAL_DIFFUSE, METAL_MIRROR, METAL_GLOSS = 0.2, 0.35, 0.6, 0.7
 
-# Minimum depth at which metal is lit, in units of the distance from the light to the centre of the picture.
+# Minimum depth at which metal is lit, as a fraction of the distance from the light to the main camera's target.
 METAL_NEAREST = 0.2
 
 Array = NDArray[np.float64]
 
-# Indices into the array of sizes: sizes of the sheet, the picture and its bins; three counters, of rows of mass points
-# that workers have taken, of rows that they have projected, and of bands that they have taken; and the levels of the
-# texture, each with its first texel, its width and its height.
+# Indices into the array of sizes: sizes of the sheet, the picture and its bins; counters of the workers, for rows
+# taken, rows projected and bands taken; levels of the texture, each with its first texel, width and height.
 ROWS, COLS, WIDTH, HEIGHT, INSTRUMENT_COUNT, BIN_SIZE, BINS_ACROSS = range(7)
 ROWS_TAKEN, ROWS_PROJECTED, BANDS_TAKEN, LEVEL_COUNT, LEVELS = range(7, 12)
 LEVEL_STRIDE = 3
@@ -60,30 +59,24 @@ MATRIX, AXES, NEAR, SUBDIVISIONS, BACKGROUND = 0, 16, 25, 26, 27
 # camera, else 0; the centre of the picture [samples].
 CENTRE_X, CENTRE_Y, SPREAD_X, SPREAD_Y, PINHOLE, MIDDLE_X, MIDDLE_Y = range(30, 37)
 
-# The light's position to the right and up, in the camera's frame [m]; its distance from the target of the main camera
-# [m]; the factor that normalises the light to 1 at the target; the scene's light settings.
-LIGHT_X, LIGHT_Y, LIGHT_DISTANCE, LIGHT_NORMALISATION, AMBIENT, GLOSS, VIGNETTE = range(37, 44)
+# The light's position in the camera's frame [m]; its distance from the target of the main camera [m]; the factor that
+# normalises the light to 1 at the target; the scene's light settings.
+LIGHT_X, LIGHT_Y, LIGHT_Z, LIGHT_DISTANCE, LIGHT_NORMALISATION, AMBIENT, GLOSS, VIGNETTE = range(37, 45)
 
-# The sheet's axes to the right and up, in the camera's frame; the slope of the relief per grey level between
-# neighbouring texels.
-ACROSS, UP, SLOPE_X, SLOPE_Y = 44, 47, 50, 51
-
-# Offset of a mass point's x and y in the picture, after its X, Y, w and depth.
-SCREEN = 4
+# The direction to the headlight, in the world. The axes of the sheet to the right and up, in the camera's frame; the
+# slope of the relief per grey level between neighbouring texels.
+HEADLIGHT, ACROSS, UP, SLOPE_X, SLOPE_Y = 45, 48, 51, 54, 55
 
 # Depth by which a surface must be nearer than a point to occlude it [m].
-DEPTH_TOLERANCE = 52
+DEPTH_TOLERANCE = 56
 
-# The lens: its coefficients; its radius at w = 1 [m]; the principal point [samples]; samples per metre at w = 1; the
-# numbers of `undistortion.VisibleRegion`, in samples.
-LENS, LENS_RADIUS, PICTURE_X, PICTURE_Y, FOCAL_X, FOCAL_Y, VISIBLE = 53, *range(61, 67)
-SAGITTA_FACTOR, STRETCH_FACTOR = 70, 71
+# The lens: its coefficients; its limit or the largest visible radius, at w = 1 [m]; the principal point [samples];
+# samples per metre at w = 1; the box and the factors of `undistortion.VisibleRegion`, in samples.
+LENS, LENS_RADIUS, PICTURE_X, PICTURE_Y, FOCAL_X, FOCAL_Y, VISIBLE = 57, *range(65, 71)
+SAGITTA_FACTOR, STRETCH_FACTOR = 74, 75
 
-# The light's position toward the camera, in the camera's frame [m]; the direction to the headlight, in the world.
-LIGHT_Z, HEADLIGHT = 72, 73
-
-# The instruments, each with the centre of its tip and its axis in the camera's frame; its length and radius; its
-# bounding box in the picture without distortion [samples]; and the number of its shape.
+# The instruments, each with the centre of its tip and its axis in the camera's frame, its length and radius [m], its
+# bounding box in the undistorted picture [samples], and the number of its shape.
 INSTRUMENTS, INSTRUMENT_STRIDE = 76, 13
 TIP, AXIS, LENGTH, RADIUS, LEFT, TOP, RIGHT, BOTTOM, KIND = 0, 3, 6, 7, 8, 9, 10, 11, 12
 KINDS = {name: float(number) for number, name in enumerate(SHAPES)}
@@ -128,8 +121,8 @@ def view_uniforms(
     normalisation = (1 + WRAP) / (light_view.distance / light_distance + WRAP)
     if light_view is not view:
         light_position = view.axes @ (light_view.eye + light_position @ light_view.axes - view.eye)
-    uniforms[[LIGHT_X, LIGHT_Y, LIGHT_Z]], uniforms[HEADLIGHT:INSTRUMENTS] = light_position, light_view.axes[2]
-    uniforms[LIGHT_DISTANCE:ACROSS] = light_distance, normalisation, light.ambient, light.gloss, light.vignette
+    uniforms[LIGHT_X:LIGHT_DISTANCE], uniforms[HEADLIGHT:ACROSS] = light_position, light_view.axes[2]
+    uniforms[LIGHT_DISTANCE:HEADLIGHT] = light_distance, normalisation, light.ambient, light.gloss, light.vignette
     uniforms[ACROSS:UP], uniforms[UP:SLOPE_X] = view.axes[:, 0], view.axes[:, 1]
     height = light.relief / 100 / 255 * max(sheet)
     uniforms[SLOPE_X:DEPTH_TOLERANCE] = height * texture[0] / sheet[1], -height * texture[1] / sheet[0]
@@ -171,7 +164,7 @@ def _instrument_uniforms(solid: Solid, view: View, factor: int) -> Array:
     corner = np.array(np.meshgrid(*[(-solid.radius, solid.radius)] * 3)).reshape(3, -1).T @ view.axes
     boxes = (ends[:, None] + corner).reshape(-1, 3)
     x, y, w, _ = view.project(boxes).T
-    # Undistorted, as all coordinates in kernels.
+    # The visible part of the undistorted picture, to which the box is clipped.
     left, right, top, bottom = (0, view.size[0], 0, view.size[1]) if view.lens is None else visible_region(view).box
     low, high = np.array([left, top]), np.array([right, bottom])
     if (w > view.near).all():

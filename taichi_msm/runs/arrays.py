@@ -40,12 +40,8 @@ def write_arrays(file: BinaryIO, arrays: Mapping[str, NDArray[Any] | ChunkedArra
     """
     with zipfile.ZipFile(file, "w", zipfile.ZIP_STORED) as archive:
         for name, array in arrays.items():
-            chunked = (
-                array
-                if isinstance(array, ChunkedArray)
-                else ChunkedArray(array.dtype, array.shape, _contiguous_chunks(array))
-            )
-            # The date is fixed, at the earliest of the zip format, so that equal arrays produce identical files.
+            chunked = _chunked(array)
+            # A fixed date, the earliest of the zip format, keeps equal files identical.
             info = zipfile.ZipInfo(f"{name}.npy", (1980, 1, 1, 0, 0, 0))
             with archive.open(info, "w", force_zip64=True) as entry:
                 entry.write(_npy_header(chunked.dtype, chunked.shape))
@@ -53,9 +49,13 @@ def write_arrays(file: BinaryIO, arrays: Mapping[str, NDArray[Any] | ChunkedArra
                     entry.write(chunk.data)
 
 
-def _contiguous_chunks(array: NDArray[Any]) -> Iterable[NDArray[Any]]:
+def _chunked(array: NDArray[Any] | ChunkedArray) -> ChunkedArray:
     """Split an array into contiguous chunks, without a copy of all of it."""
-    return [array] if array.flags.c_contiguous else (np.ascontiguousarray(row) for row in array)
+    if isinstance(array, ChunkedArray):
+        return array
+    return ChunkedArray(
+        array.dtype, array.shape, [array] if array.flags.c_contiguous else map(np.ascontiguousarray, array)
+    )
 
 
 def read_array(archive: zipfile.ZipFile, name: str, dtype: DTypeLike, shape: Shape) -> NDArray[Any]:
@@ -172,7 +172,7 @@ def read_flo(path: Path, size: tuple[int, int]) -> NDArray[np.float32]:
     width, height = size
     header, length = _flo_header(width, height), 8 * width * height
     with path.open("rb") as file:
-        # At most one byte beyond the expected size is read, so a forged file cannot exhaust the memory.
+        # One byte more than expected detects a longer file, without reading all of a forged one.
         start, data, excess = file.read(len(header)), file.read(length), file.read(1)
     if start != header or len(data) != length or excess:
         raise ValueError(f"not a flow of {width} x {height} pixels")

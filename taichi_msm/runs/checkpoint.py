@@ -49,7 +49,7 @@ CHECKPOINT_PATTERNS = (
     r"(?:manifest\.json|positions|forces)",  # of earlier versions
 )
 
-# Columns of a `TipForce` (tip, force) and of a `PeakForce` (time, force).
+# Numbers per `TipForce` (tip, force) and per `PeakForce` (time, force).
 FORCE_COLUMNS, PEAK_FORCE_COLUMNS = 6, 4
 
 
@@ -63,7 +63,7 @@ class Manifest:
     estimate: TimeStepEstimate | None  # time-step error by trial runs; None without `time.tolerance`
     mesh: MeshEstimate | None  # mesh error by trial runs; None without `sheet.tolerance`
     asks_estimate: bool | None  # whether to estimate the error during the run; None: only if cheap
-    folder: str  # directory to which picture paths are relative; the current one of `run`
+    folder: str  # working directory of `run`, to which picture paths are relative
     arch: str  # cpu, cuda or vulkan
     sha256: Mapping[str, str]  # of picture, map and camera files, by scene key
     versions: Mapping[str, str]  # of all software that affects the results
@@ -87,7 +87,7 @@ class Manifest:
                 raise FilesError(f"{path} has changed since the run began; put it back, or run the scene again")
         original, current = result_versions(self.versions, self.arch), result_versions(versions, self.arch)
         if original != current:
-            # `original` lacks a tested compiler. If only the compiler differs, the message names it nevertheless.
+            # Without another difference, the compiler differs; it is missing in `original` if it is a tested one.
             changed = any(version != current.get(name) for name, version in original.items())
             listed = original if changed else self.versions
             differing = [f"{name} {version}" for name, version in listed.items() if version != versions.get(name)]
@@ -128,7 +128,7 @@ def read_manifest(directory: Path) -> tuple[Manifest, Plan]:
             manifest = _MANIFEST_ADAPTER.validate_python(json.loads(_manifest_bytes(archive)))
         # The current directory may differ from that of the original process.
         manifest = replace(manifest, scene=manifest.scene.with_pictures(partial(os.path.join, manifest.folder)))
-    except Exception:  # zipfile raises almost any type for a forged archive
+    except Exception:  # a forged archive may raise any type
         if path.with_name("manifest.json").exists():
             problem = "is of an earlier version of the program"
             raise FilesError(f"{path} {problem}; run the scene again, or continue with that version") from None
@@ -172,7 +172,7 @@ def _open_state(directory: Path) -> BinaryIO:
 
 
 def _manifest_bytes(archive: zipfile.ZipFile) -> bytes:
-    # A manifest contains the scene twice; a scene file may have 1 MiB.
+    # 64 MiB are above the size of any manifest: it has the scene twice, from a file of at most 1 MiB.
     if archive.getinfo("manifest.npy").file_size > 1 << 26:
         raise ValueError("too large")
     return read_rows(archive, "manifest", np.uint8, ()).tobytes()
@@ -183,7 +183,7 @@ def _damaged(path: Path) -> DamagedError:
 
 
 class Checkpoint:
-    """Checkpoint folder of a run. It stays valid whenever the process is killed.
+    """Checkpoint folder of a run, which is valid whenever the process is killed.
 
     Args:
         folder: path inside the staging folder; `begin` creates it.
@@ -204,10 +204,9 @@ class Checkpoint:
         self._plan, self._state_path, self._frames_path = plan, folder / STATE_FILE, folder / FRAMES_FILE
         self._next_save, self._manifest = 0.0, b""
         self._file: BinaryIO | None = None  # None without outputs: the frames are not needed
-        self._stored_probes = len(scene.probes) if scene.asks_for("forces") else 0
         position = "position", self.precision, (*scene.sheet.points, 3)
-        forces = "forces", np.float64, (self._stored_probes, FORCE_COLUMNS)
-        self._record = np.dtype([("checksum", np.int64), position, forces])
+        forces = "forces", np.float64, (len(scene.probes), FORCE_COLUMNS)
+        self._frame_dtype = np.dtype([("checksum", np.int64), position, forces])
 
     @property
     def is_save_due(self) -> bool:
@@ -225,16 +224,15 @@ class Checkpoint:
         self._manifest = json.dumps(manifest).encode()
         if self._plan.scene.output:
             # Unbuffered, so that stored frames survive when the process is killed.
-            self._file = create_file(self._frames_path, buffering=0)
+            self._file = self._frames_path.open("x+b", buffering=0)
         self._write_state({})
 
     def invalidate(self) -> None:
-        """Delete the state, so that the remaining file no longer counts as a checkpoint."""
+        """Delete the state file, without which the folder is not a checkpoint."""
         self._state_path.unlink(missing_ok=True)
 
     def reopen(self) -> Snapshot | None:
         """Open the checkpoint of an earlier run; return its last saved state, or None for the initial state."""
-        self.close()
         saved = self.load()
         self.frames = 0 if saved is None else saved.progress.frame + 1
         if self._plan.scene.output:
@@ -245,7 +243,7 @@ class Checkpoint:
             status = os.fstat(self._file.fileno())
             if status.st_nlink > 1:
                 raise ForeignError.at(self._frames_path, "a hard-linked file")
-            if status.st_size < self.frames * self._record.itemsize:
+            if status.st_size < self.frames * self._frame_dtype.itemsize:
                 raise _damaged(self._frames_path)
         return saved
 
@@ -254,11 +252,11 @@ class Checkpoint:
 
         Args:
             position: positions of the mass points [m], shape (rows, cols, 3).
-            forces: force of every probe; stored only for scenes that output forces.
+            forces: force of every probe.
         """
         if self._file:
-            parts = np.ascontiguousarray(position, self.precision), _tip_force_array(forces)[: self._stored_probes]
-            self._file.seek(self.frames * self._record.itemsize)
+            parts = np.ascontiguousarray(position, self.precision), _tip_force_array(forces)
+            self._file.seek(self.frames * self._frame_dtype.itemsize)
             for part in (np.array(self._checksum(self.frames, *parts)), *parts):
                 remaining = part.reshape(-1).view(np.uint8).data
                 while remaining:  # a write to an unbuffered file may be partial
@@ -270,16 +268,17 @@ class Checkpoint:
         return self._read(frame)[0]
 
     def read_forces(self, frame: int) -> tuple[TipForce, ...]:
-        """Read the force of every probe in a frame; only for scenes that output forces."""
+        """Read the force of every probe in a frame."""
         return _tip_forces(self._read(frame)[1])
 
     def save(self, saved: Snapshot) -> str:
-        """Save a state in place of the previous one; all frames up to it must be stored.
+        """Save a state, whose frames must be stored, in place of the previous one.
 
-        Returns the path of the archive, which contains the fields of `State` and `RunProgress` by name.
+        Returns:
+            Path of the archive, which has the fields of `State` and `RunProgress` by name.
         """
         start = time.perf_counter()
-        self._write_state(_state_arrays(saved))
+        self._write_state(_to_arrays(saved))
         now = time.perf_counter()
         # Saving takes at most 2 % of the run's time.
         self._next_save = now + (now - start) / 0.02
@@ -287,39 +286,42 @@ class Checkpoint:
 
     def load(self) -> Snapshot | None:
         """Read the last saved state; None if there is none."""
-        scene, grid, zero = self._plan.scene, self._plan.grid, (0.0, 0.0, 0.0)
-        position = np.empty((*scene.sheet.points, 3), self.precision)
-        memory = np.empty((len(memory_names(self._plan)), *scene.sheet.points), self.precision)
-        forces = ProbeForces((TipForce(0, zero, zero),) * len(scene.probes), (PeakForce(0, zero),) * len(scene.probes))
-        expected = _state_arrays(Snapshot(State(0, position, position, memory), RunProgress(), forces))
+        expected = _to_arrays(self._empty_snapshot())
         try:
             with self._state_path.open("rb") as file, zipfile.ZipFile(file) as archive:
                 self._manifest = _manifest_bytes(archive)
-                if len(archive.namelist()) == 1:
+                if len(archive.namelist()) == 1:  # only the manifest
                     return None
                 arrays = {name: read_array(archive, name, array.dtype, array.shape) for name, array in expected.items()}
         except FileNotFoundError:
             return None
-        except Exception:  # zipfile raises almost any type for a forged archive
+        except Exception:  # a forged archive may raise any type
             raise _damaged(self._state_path) from None
-        progress = RunProgress(**{field.name: arrays[field.name].item() for field in fields(RunProgress)})
-        state = State(int(arrays["steps"]), arrays["displacement"], arrays["difference"], arrays["memory"])
-        greatest = tuple(PeakForce(time, (x, y, z)) for time, x, y, z in arrays["greatest"].tolist())
+        saved, grid = _from_arrays(arrays), self._plan.grid
         if not (
-            progress.frame <= grid.frames
-            and 0 <= state.steps - progress.frame * grid.steps_per_frame <= grid.steps_per_frame
+            saved.progress.frame <= grid.frames
+            and 0 <= saved.state.steps - saved.progress.frame * grid.steps_per_frame <= grid.steps_per_frame
             and all(np.isfinite(array).all() for array in arrays.values())
-            and all(value >= 0 for value in asdict(progress).values())
+            and all(value >= 0 for value in asdict(saved.progress).values())
         ):
             raise _damaged(self._state_path)
-        return Snapshot(state, progress, ProbeForces(_tip_forces(arrays["forces"]), greatest))
+        return saved
 
     def close(self) -> None:
         """Close the file."""
         if self._file:
             self._file.close()
 
+    def _empty_snapshot(self) -> Snapshot:
+        """Return a snapshot with the dtypes and shapes of all arrays."""
+        scene, zero = self._plan.scene, (0.0, 0.0, 0.0)
+        position = np.empty((*scene.sheet.points, 3), self.precision)
+        memory = np.empty((len(memory_names(self._plan)), *scene.sheet.points), self.precision)
+        felt = ProbeForces((TipForce(0, zero, zero),) * len(scene.probes), (PeakForce(0, zero),) * len(scene.probes))
+        return Snapshot(State(0, position, position, memory), RunProgress(), felt)
+
     def _write_state(self, arrays: Mapping[str, NDArray[Any]]) -> None:
+        """Replace the state file by the manifest and the arrays of a state."""
         draft = self._state_path.with_suffix(".new")
         draft.unlink(missing_ok=True)
         with create_file(draft) as file:
@@ -329,8 +331,8 @@ class Checkpoint:
     def _read(self, frame: int) -> tuple[NDArray[Any], NDArray[np.float64]]:
         """Read positions and forces of a frame; raise a DamagedError for non-finite values or a wrong checksum."""
         assert self._file
-        self._file.seek(frame * self._record.itemsize)
-        records = np.fromfile(self._file, self._record, 1)
+        self._file.seek(frame * self._frame_dtype.itemsize)
+        records = np.fromfile(self._file, self._frame_dtype, 1)
         if len(records) == 1:
             position, forces = records["position"][0], records["forces"][0]
             is_sound = records["checksum"][0] == self._checksum(frame, position, forces)
@@ -339,19 +341,27 @@ class Checkpoint:
         raise _damaged(self._frames_path)
 
     def _checksum(self, frame: int, *parts: NDArray[Any]) -> int:
-        """Compute the CRC-32 of a frame, its index and the manifest, which detects frames of another run or index."""
+        """Compute the CRC-32 of the manifest, the index and the parts of a frame."""
+        # The manifest and the index detect frames of another run or at another index.
         checksum = zlib.crc32(frame.to_bytes(8, "little"), zlib.crc32(self._manifest))
         for part in parts:
             checksum = zlib.crc32(part.data, checksum)
         return checksum
 
 
-def _state_arrays(saved: Snapshot) -> dict[str, NDArray[Any]]:
-    """Convert a state and its progress to arrays by name."""
+def _to_arrays(saved: Snapshot) -> dict[str, NDArray[Any]]:
+    """Convert a snapshot, without its probes, to arrays by the names of its fields."""
     forces, greatest = saved.probe_forces
     peaks = np.array([(peak.time, *peak.force) for peak in greatest]).reshape(-1, PEAK_FORCE_COLUMNS)
     named = {**saved.state._asdict(), **asdict(saved.progress), "forces": _tip_force_array(forces), "greatest": peaks}
     return {name: np.asarray(value) for name, value in named.items()}
+
+
+def _from_arrays(arrays: Mapping[str, NDArray[Any]]) -> Snapshot:
+    progress = RunProgress(**{field.name: arrays[field.name].item() for field in fields(RunProgress)})
+    state = State(int(arrays["steps"]), arrays["displacement"], arrays["difference"], arrays["memory"])
+    greatest = tuple(PeakForce(time, (x, y, z)) for time, x, y, z in arrays["greatest"].tolist())
+    return Snapshot(state, progress, ProbeForces(_tip_forces(arrays["forces"]), greatest))
 
 
 def _tip_force_array(forces: Sequence[TipForce]) -> NDArray[np.float64]:

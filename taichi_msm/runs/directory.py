@@ -4,15 +4,15 @@ A publication has three steps:
 
 1. Write the new results to `.partial/new` inside the directory.
 2. Commit: rename this folder to `.partial/whole`.
-3. Move the record of the earlier results aside, and the new files into place. Delete obsolete files. Move the new
-   record into place, last.
+3. Move the record of the earlier results aside. Move the new files into place, and delete obsolete ones. Last, move the
+   new record into place.
 
-So a directory with a record contains complete and consistent results. A process killed before the commit leaves the
-directory unchanged; after the commit, the next publication completes step 3.
+A directory with a record therefore contains complete and consistent results. A process killed before the commit leaves
+the directory unchanged; after the commit, the next publication completes step 3.
 
 The record lists the files of a publication, and only listed files are replaced or deleted. A foreign entry at the path
-of a result, such as a link or a device, is an error before any change. Folders are checked when a publication begins;
-from then on, files are created exclusively. Processes with write access to the directory during a run are trusted.
+of a result, such as a link or a device, is an error before any change. Folders are checked at the beginning of a
+publication; files are opened for creation only. Processes that write to the directory during a run are trusted.
 
 Single files are replaced atomically, too: they are written to a hidden folder next to their destination and renamed.
 """
@@ -34,12 +34,21 @@ from typing import Any, BinaryIO, NamedTuple
 
 from taichi_msm.errors import DamagedError, FilesError, ForeignError
 
-STAGING_FOLDER, NEW_FOLDER, READY_FOLDER, PREVIOUS_RECORD = ".partial", "new", "whole", "earlier.json"
+if sys.platform == "win32":
+    import msvcrt
+else:
+    import fcntl
 
-# Size limit of a record, above the size of any run's.
+STAGING_FOLDER, NEW_FOLDER, READY_FOLDER, PREVIOUS_RECORD = ".partial", "new", "whole", "earlier.json"
+LOCK_FILE, DRAFT_FILE = "lock", "draft"
+
+# Kinds of directory entries, for `entry_kind` and messages.
+FILE, FOLDER = "a file", "a folder"
+
+# Limit of the size of a record; no run has a larger one.
 MAX_RECORD_BYTES = 1 << 28
 
-# Predicate of file names: whether a record lists them.
+# Predicate of a file name: whether the record lists it.
 IsListed = Callable[[str], bool]
 
 
@@ -51,7 +60,8 @@ class PublicationSpec(NamedTuple):
     patterns: Collection[str]  # of all files that may be published, including the record
     read_record: Callable[[Mapping[str, Any]], IsListed]  # converts a record to a predicate of file names
     exclusive: bool = False  # whether other files in the directory are errors
-    companion: tuple[str, Collection[str]] | None = None  # an unpublished folder, and patterns of its files
+    # Folder next to the new files that is kept but not published, and patterns of its files.
+    unpublished: tuple[str, Collection[str]] | None = None
 
 
 class Publication:
@@ -59,7 +69,7 @@ class Publication:
 
     Args:
         directory: destination; created if missing.
-        spec: kind of the publication.
+        spec: files of the publication, and content of its record.
         names: names of all files that may be published; checked for conflicts with foreign files.
 
     Raises:
@@ -70,18 +80,18 @@ class Publication:
     Attributes:
         staging_folder: folder for unpublished files.
         new_folder: folder for the new files under their final names.
-        keep_companion: whether the companion folder is kept at exit.
+        keep_unpublished: whether the unpublished folder of the spec is kept at exit.
     """
 
     def __init__(self, directory: Path, spec: PublicationSpec, names: Collection[str] = ()) -> None:
         self.staging_folder = directory / STAGING_FOLDER
         self.new_folder = self.staging_folder / NEW_FOLDER
-        self.keep_companion = True
+        self.keep_unpublished = True
         self._directory, self._spec, self._record = directory, spec, directory / spec.record
-        self._companion, inner = spec.companion or ("", ())
+        self._unpublished, inner = spec.unpublished or ("", ())
         self._patterns = [
             *(rf"{folder}/{pattern}" for folder in (NEW_FOLDER, READY_FOLDER) for pattern in spec.patterns),
-            *(rf"{self._companion}/{pattern}" for pattern in inner),
+            *(rf"{self._unpublished}/{pattern}" for pattern in inner),
             *(LOCK_FILE, re.escape(PREVIOUS_RECORD)),
         ]
         with ExitStack() as opened:
@@ -157,7 +167,7 @@ class Publication:
                 raise ForeignError.at(self._directory / name, actual)
 
     def _complete(self) -> None:
-        """Move committed files into place; complete an interrupted publication."""
+        """Complete a committed publication, this one or an interrupted one: move its files into place."""
         ready, moved_record = self.staging_folder / READY_FOLDER, self.staging_folder / PREVIOUS_RECORD
         record = ready / self._spec.record
         if entry_kind(record) is None:
@@ -165,14 +175,14 @@ class Publication:
         try:
             is_new = self._read_record(record)
             if not is_new(record.name):
-                raise ValueError("no record of itself")
+                raise ValueError
         except ValueError:
             raise DamagedError(f"{record} is damaged; remove {self.staging_folder} and run the scene again") from None
-        is_resumed = entry_kind(moved_record) is not None
-        earlier = self._listed_results(moved_record if is_resumed else self._record)
+        is_continued = entry_kind(moved_record) is not None
+        earlier = self._listed_results(moved_record if is_continued else self._record)
         remaining = list(list_files(ready, self._spec.patterns, strict=True))
         self._require_free(remaining, earlier)
-        if not is_resumed and entry_kind(self._record) is not None:
+        if not is_continued and entry_kind(self._record) is not None:
             self._record.replace(moved_record)
         for name in remaining:
             if name != record.name:
@@ -187,9 +197,9 @@ class Publication:
         record.replace(self._record)
 
     def _clear(self) -> None:
-        """Delete the contents of the staging folder except for the lock and a kept companion."""
+        """Delete the contents of the staging folder, except the lock and a kept folder."""
         list(list_files(self.staging_folder, self._patterns, strict=True))  # raises an error for foreign files
-        keep = (LOCK_FILE, self._companion) if self.keep_companion else (LOCK_FILE,)
+        keep = (LOCK_FILE, self._unpublished) if self.keep_unpublished else (LOCK_FILE,)
         for path in [path for path in self.staging_folder.iterdir() if path.name not in keep]:
             if entry_kind(path) == FOLDER:
                 shutil.rmtree(path)
@@ -199,7 +209,7 @@ class Publication:
     def _acquire(self, opened: ExitStack) -> BinaryIO:
         """Create the staging folder, and lock it until all processes with the lock's descriptor have ended."""
         path = self.staging_folder / LOCK_FILE
-        # An ending run may delete the folder before the lock is opened or acquired.
+        # Another publication may end and delete the folder or the lock at any moment; then try again.
         for _ in range(100):
             with suppress(FileNotFoundError), ExitStack() as attempt:
                 with suppress(FileExistsError):
@@ -220,9 +230,6 @@ def _try_to_remove(remove: Callable[[], None]) -> None:
         remove()
 
 
-FILE, FOLDER = "a file", "a folder"
-
-
 def entry_kind(path: Path) -> str | None:
     """Return the kind of a directory entry: FILE, FOLDER or a description, such as of a link; None if missing."""
     try:
@@ -236,12 +243,12 @@ def entry_kind(path: Path) -> str | None:
     return "a symbolic link" if stat.S_ISLNK(mode) else "a pipe or a device"
 
 
-def require_kind(path: Path, wanted: str) -> Path:
+def require_kind(path: Path, kind: str) -> Path:
     """Require that an entry is of the expected kind, or missing.
 
     Args:
         path: entry of a directory; links are not followed.
-        wanted: expected kind, FILE or FOLDER.
+        kind: expected kind, FILE or FOLDER.
 
     Returns:
         The path.
@@ -249,13 +256,13 @@ def require_kind(path: Path, wanted: str) -> Path:
     Raises:
         ForeignError: when the entry is of another kind, such as a link.
     """
-    if (actual := entry_kind(path)) not in (None, wanted):
+    if (actual := entry_kind(path)) not in (None, kind):
         raise ForeignError.at(path, str(actual))
     return path
 
 
 def require_no_link(folder: Path, option: str) -> Path:
-    """Require that a default folder is not a symbolic link, possibly of an untrusted scene.
+    """Require that a default folder is not a symbolic link, which may come with an untrusted scene.
 
     Args:
         folder: default destination, which may be missing.
@@ -277,21 +284,21 @@ def require_no_link(folder: Path, option: str) -> Path:
 
 
 def list_files(top: Path, patterns: Collection[str], *, strict: bool, ignored: Collection[str] = ()) -> Iterator[str]:
-    """List the files below a folder whose relative paths match a pattern. Links are not followed.
+    """Yield the files below a folder whose relative paths match a pattern; links are not followed.
 
     Args:
         top: root of the relative paths.
-        patterns: regular expressions of relative paths; their parts before slashes match the subfolders.
+        patterns: regular expressions of relative paths; the part before each slash is that of a subfolder.
         strict: whether entries without a match are errors.
         ignored: names of entries to ignore.
 
-    Returns:
+    Yields:
         Paths relative to `top`, with slashes.
 
     Raises:
         ForeignError: with `strict`, at the first entry that matches no pattern.
     """
-    allowed, folders = re.compile("|".join(patterns)), re.compile("|".join(parent_folders(patterns)))
+    files, folders = re.compile("|".join(patterns)), re.compile("|".join(parent_folders(patterns)))
 
     def walk(folder: Path, prefix: str) -> Iterator[str]:
         for path in folder.iterdir():
@@ -300,7 +307,7 @@ def list_files(top: Path, patterns: Collection[str], *, strict: bool, ignored: C
                 continue
             if actual == FOLDER and folders.fullmatch(name):
                 yield from walk(path, f"{name}/")
-            elif actual == FILE and allowed.fullmatch(name):
+            elif actual == FILE and files.fullmatch(name):
                 yield name
             elif strict:
                 raise ForeignError.at(path, actual)
@@ -312,14 +319,6 @@ def parent_folders(names: Iterable[str]) -> set[str]:
     """Collect all ancestor folders of relative paths."""
     inner = {name.rpartition("/")[0] for name in names if "/" in name}
     return inner | parent_folders(inner) if inner else inner
-
-
-if sys.platform == "win32":
-    import msvcrt
-else:
-    import fcntl
-
-LOCK_FILE, DRAFT_FILE = "lock", "draft"
 
 
 @contextmanager
@@ -354,9 +353,10 @@ def hidden_folder(folder: Path) -> Iterator[Path]:
 
 
 def _clear_abandoned(folder: Path) -> None:
+    """Delete the hidden folders of killed processes."""
     for hidden in list(folder.iterdir()):
         if re.fullmatch(r"\.partial-[0-9a-f]{16}", hidden.name) and entry_kind(hidden) == FOLDER:
-            # Folders that are locked, incomplete, of another user or with foreign files are kept.
+            # Others are kept: locked or incomplete ones, those of other users, and those with foreign files.
             with suppress(OSError, FilesError):
                 pattern = r"lock|draft|picture|session|copy|animation\.(?:gif|mp4)|study\.(?:png|md|json)|sweep\.json"
                 list(list_files(hidden, [pattern], strict=True))
@@ -414,20 +414,9 @@ def link_without_replacing(draft: Path, path: Path) -> bool:
     return True
 
 
-def create_file(path: Path, buffering: int = -1) -> BinaryIO:
-    """Create a file and open it for writing and reading.
-
-    Args:
-        path: new path in an existing folder.
-        buffering: size of the buffer [bytes], as for `open`; -1 for its default, 0 for none.
-
-    Returns:
-        The open file.
-
-    Raises:
-        FileExistsError: when the path exists.
-    """
-    return path.open("x+b", buffering)
+def create_file(path: Path) -> BinaryIO:
+    """Create a file, and open it for writing and reading; raise a FileExistsError if it exists."""
+    return path.open("x+b")
 
 
 def write_new_file(path: Path, data: bytes) -> None:
@@ -460,7 +449,7 @@ def lock_file(path: Path) -> BinaryIO:
 
 
 def _try_lock(file: BinaryIO) -> bool:
-    """Lock an open file; return False if the file system has no locks."""
+    """Lock an open file; return False if the file system has no locks, raise a BlockingIOError if it is locked."""
     try:
         if sys.platform == "win32":
             msvcrt.locking(file.fileno(), msvcrt.LK_NBLCK, 1)

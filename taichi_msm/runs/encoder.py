@@ -38,7 +38,7 @@ class EncodingJob(NamedTuple):
     size: tuple[int, int]  # width and height [px]
     rate: float  # frames per second
     outputs: tuple[str, ...]  # names of outputs; others than png, gif and mp4 are ignored
-    background: tuple[int, int, int]  # a colour that the GIF contains exactly
+    background: tuple[int, int, int]  # colour that the palette of the GIF contains exactly
     quality: int  # of the MP4 [%]
 
     def still_paths(self, number: int) -> list[Path]:
@@ -81,8 +81,9 @@ class PictureWriter:
             pictures: colours, shape (cameras, height, width, 3); the caller must not change them afterwards.
         """
         paths = self._job.still_paths(self._added_frames)
-        for path in paths if self._added_frames == 0 else ():
-            path.parent.mkdir()
+        if self._added_frames == 0:
+            for path in paths:
+                path.parent.mkdir()
         self._added_frames += 1
         stills = [self._still_executor.submit(_write_still, *each) for each in zip(pictures, paths, strict=False)]
         self._pending.append(self._video_executor.submit(self._complete_frame, pictures, stills))
@@ -95,7 +96,7 @@ class PictureWriter:
         for frame in self._pending:
             frame.result()
         self._video_executor.submit(self._close_videos).result()
-        # An interruption of `add` may leave stills without a frame of the videos.
+        # After an interruption of `add`, the last frame may have PNGs, and be missing in the videos.
         self._still_executor.shutdown()
         for number in range(self._frames, self._added_frames):
             for path in self._job.still_paths(number):
@@ -150,7 +151,7 @@ def _write_still(picture: Picture, path: Path) -> float:
 
 
 class Encoder:
-    """Child process that encodes pictures.
+    """Encoder of pictures in a child process, with the methods of `PictureWriter`.
 
     Args:
         job: formats, destinations and size of the pictures.

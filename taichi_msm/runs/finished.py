@@ -63,11 +63,12 @@ class FinishedRun:
         rest = rest_positions(self.scene.sheet)
         with reading(path):
             positions = map_array(path, "position", dtype, (self.frames, *rest.shape))
-        # A dynamic run begins with the flat sheet. Kernels and export formats need values within f32. The
-        # comparison also rejects NaN.
+        # A dynamic run begins with the flat sheet.
+        if not (self.scene.time.at_rest or np.array_equal(positions[0], rest.astype(dtype))):
+            raise damaged_result(path)
+        # Kernels and export formats need values in the range of f32; NaN compares as false.
         largest = float(np.finfo(np.float32).max)
-        starts_flat = self.scene.time.at_rest or np.array_equal(positions[0], rest.astype(dtype))
-        if not starts_flat or not all(np.abs(position).max() <= largest for position in positions):
+        if not all(np.abs(position).max() <= largest for position in positions):
             raise damaged_result(path)
         return positions
 
@@ -75,7 +76,7 @@ class FinishedRun:
         """Read the picture of a frame.
 
         Args:
-            key: entry of `output` that wrote the picture, such as "png".
+            key: entry of `output`, such as "png".
             frame: index, from 0.
 
         Returns:
@@ -104,7 +105,7 @@ class FinishedRun:
         self._require_unchanged()
 
     def _require_unchanged(self) -> None:
-        # A publication first moves the earlier run.json away.
+        # A new publication moves run.json away before other files.
         data = b""
         with suppress(OSError):
             data = read_regular(self.directory / RUN_RECORD, MAX_RECORD_BYTES)
@@ -112,7 +113,7 @@ class FinishedRun:
             raise FilesError(f"{self.directory}: another run replaced these results while they were read; try again")
 
     def require_same_pictures(self, *, drawn: bool) -> None:
-        """Require maps, and if `drawn` also the picture, with the SHA-256 of the run; raise a FilesError otherwise."""
+        """Raise a FilesError unless the maps, and if `drawn` the picture, have the SHA-256 of the run."""
         for key, path in self.scene.pictures.items():
             if key == "image" and not drawn:
                 continue
@@ -174,14 +175,14 @@ class FinishedRun:
             FilesError: when the file is missing, or an entry on the path is of another kind.
         """
         relative = path.relative_to(self.directory)
-        for inner in [*list(relative.parents)[-2::-1], relative]:
-            ancestor = self.directory / inner
-            with reading(ancestor):
-                kind = entry_kind(ancestor)
-            if kind not in (None, FILE if ancestor == path else FOLDER):
-                raise FilesError(f"{ancestor}: {kind}, which no run writes; {self.remedy(key)}")
+        for inner in [*reversed(relative.parents), relative][1:]:  # without the run's folder itself
+            entry = self.directory / inner
+            with reading(entry):
+                kind = entry_kind(entry)
             if kind is None:
-                raise FilesError(f"{ancestor}: no such file; {self.remedy(key)}")
+                raise FilesError(f"{entry}: no such file; {self.remedy(key)}")
+            if kind != (FILE if inner == relative else FOLDER):
+                raise FilesError(f"{entry}: {kind}, which no run writes; {self.remedy(key)}")
         return path
 
 
@@ -237,7 +238,7 @@ def _read_scene(record: Mapping[str, Any]) -> Scene:
     if folder != Path.cwd():
         scene = scene.with_pictures(lambda path: str(folder / path))
     problems = [*try_plan(scene)[1], *camera_problems(scene)]
-    # Ignored: pictures, which later methods check when needed, and the step, which was valid for the original map.
+    # Other problems are ignored: later methods check the pictures, and the step was valid with the original map.
     if any(problem.path[-1:] != ("image",) and problem.path[0] != "time" for problem in problems):
         raise SceneError([str(problem) for problem in problems])
     return scene

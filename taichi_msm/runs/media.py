@@ -1,9 +1,8 @@
 """Streaming writers of animated GIF and MP4.
 
-GIF: all frames share a palette, and their times are exact to 10 ms at any frame rate. At most two frames are queued,
-whereas Pillow's writer keeps all frames in memory; for RGB pictures, it also computes a palette per frame, which takes
-24 times longer. A frame of 512 x 512 pixels of shaded tissue takes 4 ms and 89 kB. Floyd-Steinberg dithering would take
-7 ms and 115 kB, and flicker.
+GIF: all frames share a palette, and their times are exact to 10 ms at any frame rate. At most two frames are queued.
+Pillow's writer keeps all frames in memory, and computes a palette for each one, which takes 24 times longer. A frame of
+512 x 512 pixels of shaded tissue takes 4 ms and 89 kB; with Floyd-Steinberg dithering, 7 ms and 115 kB, with flicker.
 
 MP4: H.264, encoded by PyAV, whose wheels include the encoder (`docs/decisions/0029`).
 """
@@ -23,7 +22,7 @@ from PIL import Image
 
 Picture = NDArray[np.uint8]  # colours, shape (height, width, 3), or palette indices, shape (height, width)
 
-# Limits of a frame's delay [1/100 s]: browsers replace 0 and 1 by 10, and the field has 16 bits.
+# Limits of a frame's duration [1/100 s]: browsers replace 0 and 1 by 10, and the field has 16 bits.
 MIN_GIF_DELAY = 2
 MAX_GIF_DELAY = 0xFFFF
 
@@ -34,8 +33,8 @@ TRANSPARENT_INDEX = PALETTE_SIZE
 
 def predict_colours(picture: Picture) -> Picture:
     """Predict typical colours of an animation, shape (n, m, 3), from its first frame, shape (height, width, 3)."""
-    # A grid of at most 48 pixels per axis, at several brightnesses: the first frame shows the sheet at rest; later,
-    # parts of the sheet turn toward the headlight or away.
+    # Pixels of a coarse grid, at most 48 per axis, at several brightnesses: later, parts of the sheet turn toward the
+    # headlight or away.
     stride = -(-max(picture.shape) // 48)
     samples = picture[::stride, ::stride].astype(np.float32)
     brightnesses = (1.0, 1.0, 1.0, 1.0, 1.15, 1.3, 0.8, 0.6, 0.35, 0.15)
@@ -92,7 +91,7 @@ class GifWriter:
         self._palette = palette
         self._frames = 0
         self._latest: Picture | None = None
-        # Start times [1/100 s] and palette indices. Two are queued, because a short last frame shortens the other.
+        # Start time [1/100 s] and palette indices of two frames, because a short last frame shortens its predecessor.
         self._queue: deque[tuple[int, Picture]] = deque()
         self._screen: Picture | None = None
         self._file = file
@@ -125,11 +124,12 @@ class GifWriter:
         return round(100 * frame / self._rate)
 
     def _write_last(self, indices: Picture) -> None:
-        """Write the queued frames, and the latest frame at the end."""
+        """Write the queued frames, with the latest frame in place of the last one."""
         first, last = self._queue[0][0], self._queue.pop()[0]
         end = self._centiseconds(self._frames)
         start = min(last, end - MIN_GIF_DELAY)
         if start - first < MIN_GIF_DELAY:
+            # The frame before would be too short, or does not exist.
             self._queue.clear()
             start = first
         else:
@@ -163,7 +163,7 @@ class GifWriter:
         self._file.write(b"\x08" + Image.fromarray(patch).tobytes("gif", "L", 8, 0) + b"\x00")
 
 
-# Colour space and range of HDTV, stated in the file; otherwise players choose them by the size of the picture.
+# Colour space and range of HDTV. Without them in the file, players choose others by the size of the picture.
 BT709, LIMITED_RANGE = 1, 1
 
 # Largest denominator of a frame rate or of its inverse; the time base of MP4 has 32 bits.

@@ -84,7 +84,7 @@ class Playback:
         return self._simulation.labels(camera, *self._frame_state(frame))
 
     def flow(self, first: int, second: int, camera: CameraLike = None, camera_then: CameraLike = None) -> Flow:
-        """Compute the optical flow from one frame to another, and the occlusion of the first one's pixels there.
+        """Compute the optical flow from one frame to another, and the occlusion of the first one's pixels in the other.
 
         Args:
             first: index of the frame that the flow starts from.

@@ -23,6 +23,7 @@ from taichi_msm.errors import (
     DeviceError,
     DivergedError,
     FilesError,
+    Pause,
     SceneError,
     StageProgressCallback,
     require_path,
@@ -92,15 +93,15 @@ def run(
 ) -> RunRecord:
     """Simulate a scene and write its results atomically.
 
-    An unfinished run of the same scene in the directory is continued, to the same bits as without interruption. A run
-    with an error estimate but without `output` starts again, because the estimate needs all frames.
+    An unfinished run of the same scene in the directory is continued, with the same bits as without interruption.
+    Without `output` no frames are stored, so a run with an error estimate, which needs all frames, starts again.
 
     Args:
         scene: the scene, from `load_scene` or as a mapping with the keys of a scene file.
         directory: destination of frames/, animation.gif, animation.mp4, trajectory.npz, forces.csv and run.json; with
             several cameras, pictures and labels go to a subfolder named after each camera.
         arch: cpu, cuda or vulkan.
-        threads: number of CPU threads; None for all cores. With 1, pictures are encoded in this process, too.
+        threads: number of CPU threads; None for all cores. With 1, this process also encodes the pictures.
         overrides: overrides already applied to the scene file, for run.json.
         estimate_error: whether to estimate the error by companion runs; None: only if they take at most two fifths of
             the run's time. A scene with a tolerance always has an estimate.
@@ -109,8 +110,8 @@ def run(
             stops the run; after a KeyboardInterrupt, finished frames are kept.
 
     Returns:
-        The content of run.json. Its "status" is "complete", "diverged" ("error" then contains the location and the
-        cause) or "interrupted". `resume` continues diverged, interrupted and killed runs.
+        The content of run.json. Its "status" is "complete", "interrupted" or "diverged", with the location and the
+        cause in "error". `resume` continues diverged, interrupted and killed runs.
 
     Raises:
         ArgumentError: when an argument is invalid.
@@ -148,7 +149,7 @@ def run(
     )
     context = _RunContext(manifest, plan, texture, device, folder)
     if unfinished := _find_unfinished(context):
-        with suppress(DamagedError):
+        with suppress(DamagedError):  # a damaged run starts again
             return _execute(
                 context._replace(manifest=_add_current_versions(unfinished)), stopwatch, progress, resumes=True
             )
@@ -194,19 +195,19 @@ def resume(
 
 
 def _find_unfinished(context: _RunContext) -> Manifest | None:
-    """Find the unfinished run in the directory, if it produces the same bits and the same error estimate."""
+    """Return the manifest with the versions of the unfinished run; None unless both have the same bits and estimate."""
     try:
         unfinished, _ = read_manifest(context.directory)
     except (FilesError, SceneError):
         return None
-    same_estimate = _choose_companions(context, resumed=True) == _choose_companions(context, resumed=False)
-    if context.manifest.has_same_bits_as(unfinished) and same_estimate:
+    has_same_estimate = _choose_companions(context, resumed=True) == _choose_companions(context, resumed=False)
+    if context.manifest.has_same_bits_as(unfinished) and has_same_estimate:
         return replace(context.manifest, versions=unfinished.versions)
     return None
 
 
 def _add_current_versions(manifest: Manifest) -> Manifest:
-    """Add the versions of this process to those of the original one, as both compilers may have been used."""
+    """Add the versions of this process to a manifest, as the compilers of both processes affect the results."""
     return replace(manifest, versions={**manifest.versions, **versions()})
 
 
@@ -265,34 +266,34 @@ class _Run:
             )
         )
         self._simulation = opened.enter_context(Simulation(plan, device.arch, device.threads, context.texture, cores))
-        self._resumed = self._writer.stored_frames
-        companions = _choose_companions(context, resumed=self._resumed > 0)
-        self._error: RunErrorEstimator | None = None
+        self._resumed_frames = self._writer.stored_frames
+        companions = _choose_companions(context, resumed=self._resumed_frames > 0)
+        self._error_estimator: RunErrorEstimator | None = None
         self._path_dependence = PathDependence(plan) if plan.scene.time.at_rest else None
         requested = manifest.asks_estimate
-        self._repeats_solution = self._path_dependence is not None and (
+        self._seeks_second_solutions = self._path_dependence is not None and (
             requested is True
             or (requested is None and device.arch == "cpu" and self._path_dependence.affords(companions.cost))
         )
         self._estimates = RunErrorEstimates(manifest.estimate, companions.reason, manifest.mesh)
         if companions.planned:
             try:
-                self._error = RunErrorEstimator(plan, companions, self._estimates, device, cores)
+                self._error_estimator = RunErrorEstimator(plan, companions, self._estimates, device, cores)
             except DeviceError:
                 self._estimates = self._estimates._replace(reason=f"{device.arch} cannot run this scene in f64")
 
     def verify_stored_frames(self) -> None:
         """Verify the checksums of stored positions before they are used."""
-        for frame in range(self._resumed if self._context.plan.scene.output else 0):
-            self._progress("check", frame, self._resumed)
+        for frame in range(self._resumed_frames if self._context.plan.scene.output else 0):
+            self._progress("check", frame, self._resumed_frames)
             self._writer.read_positions(frame)
 
     def prepare(self) -> None:
         """Compile, and restore the simulation to the state of the unfinished run."""
         with self._stopwatch.stage("compile"):
             self._simulation.compile(partial(self._progress, "compile", 0, self._frames))
-            if self._error:
-                self._error.compile()
+            if self._error_estimator:
+                self._error_estimator.compile()
         if self._writer.saved:
             self._simulation.restore(self._writer.saved)
 
@@ -301,57 +302,69 @@ class _Run:
         writer, simulation, scene = self._writer, self._simulation, self._context.plan.scene
         stage, rest = self._stopwatch.stage, rest_positions(scene.sheet)
         observed = dict.fromkeys(scene.render.all_cameras, FrameOutputs())
-        # Frames without steps (the first one, redrawn ones) are a stage of their own: they distort the remaining time.
-        redrawn_frames = max(self._resumed, 1)
+        # The first frame and redrawn frames have no steps. They are another stage, because they would distort the
+        # estimate of the remaining time.
+        redrawn_frames = max(self._resumed_frames, 1)
         for frame in range(0 if scene.output else writer.frames, self._frames):
             stage_name, total = ("redraw", redrawn_frames) if frame < redrawn_frames else ("frames", self._frames)
             report = partial(self._progress, stage_name, frame, total)
             report()
             with stage("simulate"):
                 simulation.advance(max(0, frame - simulation.frame), self._pause)
-            position = writer.read_positions(frame) if frame < self._resumed else simulation.positions()
-            if frame == writer.frames:  # without pictures and labels, stored frames are complete
+            position = writer.read_positions(frame) if frame < self._resumed_frames else simulation.positions()
+            if frame == writer.frames:  # otherwise it is stored, and has no pictures or labels
                 with stage("render"):
                     time = frame / scene.time.frames_per_second
                     for camera, previous in observed.items():
                         observed[camera] = simulation.observe(previous.labels, camera, position, time)
                 writer.add(position, observed, simulation.forces())
-            if self._path_dependence:
-                self._path_dependence.check_frame(frame, position - rest)
-            if self._error and frame > 0:
-                with stage("pilot"):
-                    tool_forces = [simulation.forces()[tool.probe].force for tool in self._context.plan.tools]
-                    forces = np.array(tool_forces).reshape(-1, 3) if frame >= self._resumed else None
-                    self._error.compare_frame(position - rest, report, forces)
-        # An interruption here is ignored: all frames are finished, and the coarse companion run has its estimate.
+            self._compare_frame(frame, position - rest, report)
+        # All frames are finished and have an error estimate. An interruption only skips its refinement.
         with suppress(KeyboardInterrupt):
-            if self._error:
-                displacements = (writer.read_positions(frame) - rest for frame in range(1, self._frames))
-                with stage("pilot"):
-                    self._error.finish(displacements if scene.output else None, partial(self._progress, "pilot"))
-            if self._path_dependence and self._repeats_solution:
-                report = partial(self._progress, "pilot", 0, 1)
-                with stage("pilot"):
-                    self._path_dependence.finish(self._context.device, self._cores, report)
+            self._refine_estimate()
+
+    def _compare_frame(self, frame: int, displacement: NDArray[Any], pause: Pause) -> None:
+        """Compare the displacements of a frame with those of the companion runs, and check them for a jump."""
+        if self._path_dependence:
+            self._path_dependence.check_frame(frame, displacement)
+        if self._error_estimator and frame > 0:
+            with self._stopwatch.stage("pilot"):
+                is_stored = frame < self._resumed_frames
+                by_probe = self._writer.read_forces(frame) if is_stored else self._simulation.forces()
+                forces = np.array([by_probe[tool.probe].force for tool in self._context.plan.tools]).reshape(-1, 3)
+                self._error_estimator.compare_frame(displacement, pause, forces)
+
+    def _refine_estimate(self) -> None:
+        """Run the subsequent companion runs, and look for second solutions of a quasi-static scene."""
+        scene, stage = self._context.plan.scene, self._stopwatch.stage
+        if self._error_estimator:
+            rest = rest_positions(scene.sheet)
+            displacements = (self._writer.read_positions(frame) - rest for frame in range(1, self._frames))
+            with stage("pilot"):
+                self._error_estimator.finish(displacements if scene.output else None, partial(self._progress, "pilot"))
+        if self._path_dependence and self._seeks_second_solutions:
+            with stage("pilot"):
+                pause = partial(self._progress, "pilot", 0, 1)
+                self._path_dependence.finish(self._context.device, self._cores, pause)
 
     def save_finished_frames(self) -> dict[str, Any]:
         """Save the state and the finished frames of an interrupted run; reraise if there is no new frame."""
         writer, simulation = self._writer, self._simulation
-        # The last simulated frame may not have been stored.
+        # A saved state needs all of its frames, and the last simulated frame may not be stored yet.
         if simulation.steps > 0 and simulation.frame < writer.stored_frames and not simulation.inconsistent:
             # A divergence within this frame will recur in the resumed run.
             with suppress(DivergedError):
                 writer.save(simulation.save())
-        if writer.frames > self._resumed:
+        if writer.frames > self._resumed_frames:
             writer.finish()
-        if writer.frames <= self._resumed:  # also if an incomplete last frame was dropped
+        if writer.frames <= self._resumed_frames:  # `finish` drops an incomplete last frame
             raise KeyboardInterrupt
         return {"status": "interrupted"}
 
     def diagnose_divergence(self, error: DivergedError) -> dict[str, Any]:
         """Diagnose the divergence, and save the last valid state."""
         writer = self._writer
-        self._error, self._estimates = None, RunErrorEstimates(reason="the run diverged")
+        self._error_estimator, self._estimates = None, RunErrorEstimates(reason="the run diverged")
         ending: dict[str, Any] = {"status": "diverged", "error": str(error), "dump": None}
         with suppress(KeyboardInterrupt):
             report = partial(self._progress, "diagnosis", writer.frames, self._frames)
@@ -372,7 +385,7 @@ class _Run:
         record = {
             **ending,
             **self._scene_entries(),
-            "resumed": self._resumed,
+            "resumed": self._resumed_frames,
             "timings": {**timings, "encode": writer.encode_seconds, "total": self._stopwatch.total()},
             "arch": device.arch,
             "device": device.name,
@@ -388,7 +401,7 @@ class _Run:
         """Build the entries of run.json about the scene, the last frame and the errors."""
         manifest, plan, progress = self._context.manifest, self._context.plan, self._simulation.progress
         scene = plan.scene
-        estimates = self._error.estimates if self._error else self._estimates
+        estimates = self._error_estimator.estimates if self._error_estimator else self._estimates
         probes = [
             ProbeRecord(
                 **record,
@@ -398,12 +411,8 @@ class _Run:
             )
             for record, peak in zip(probe_records(scene), self._simulation.felt.greatest, strict=True)
         ]
-
-        def takes_an_hour_at_most(plan: Plan) -> bool:
-            return cost.estimate_duration(plan).seconds <= 3600
-
         notes = [
-            *run_warnings(plan, probes, progress, estimates, takes_an_hour_at_most, _pixels_per_metre(scene)),
+            *run_warnings(plan, probes, progress, estimates, _runs_within_an_hour, _pixels_per_metre(scene)),
             *(self._path_dependence.warnings() if self._path_dependence else ()),
             *drawing_warnings(scene),
         ]
@@ -448,6 +457,10 @@ def _choose_companions(context: _RunContext, *, resumed: bool) -> CompanionRuns:
     return companions
 
 
+def _runs_within_an_hour(plan: Plan) -> bool:
+    return cost.estimate_duration(plan).seconds <= 3600
+
+
 def _step_entries(plan: Plan, progress: RunProgress) -> dict[str, Any]:
     """Build the entries about the time steps, or for a quasi-static scene about the residual."""
     grid, limit = plan.grid, plan.stable_step
@@ -481,7 +494,7 @@ def _requested_values(given: Scene, scene: Scene) -> dict[str, Any]:
 
 
 def _pixels_per_metre(scene: Scene) -> float | None:
-    """Return the image scale at the centre of the sheet [px/m]; None without pictures or with the centre outside."""
+    """Return the image scale at the centre of the sheet [px/m]; None without pictures or if it is out of view."""
     if not scene.renders:
         return None
     centre, right, up = view_at(scene, 0.0, next(iter(scene.render.all_cameras))).pixels(
@@ -496,12 +509,12 @@ def _error_record(estimates: RunErrorEstimates) -> dict[str, Any] | None:
     estimate, mesh, keys = estimates.time_step, estimates.mesh, ("error", "rounding", "in_f64", "order", "at_least")
     if estimate is not None:
         fields: dict[str, Any] = {key: getattr(estimate, key) for key in keys}
+        if not estimate.separate:
+            fields |= {"rounding": None, "in_f64": None}
     elif mesh is not None and estimates.reason == QUASISTATIC_REASON:
         fields = dict.fromkeys(keys) | {"at_least": False}
     else:
         return None
-    if estimate is not None and not estimate.separate:
-        fields |= {"rounding": None, "in_f64": None}
     if mesh is not None:
         fields |= {"mesh_error": mesh.error, "mesh_doubt": mesh.doubt}
     if estimates.force is not None:

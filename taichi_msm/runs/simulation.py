@@ -51,13 +51,13 @@ class Simulation:
     """Simulation of a scene, frame by frame. As a context manager, it frees its memory at exit.
 
     Args:
-        scene: the scene, from `load_scene` or as a mapping with the keys of a scene file. With a tolerance, companion
+        scene: the scene, from `load_scene` or as a mapping with the keys of a scene file. If it has a tolerance, trial
             runs first choose the mesh or the step.
         arch: cpu, cuda or vulkan.
         threads: number of CPU threads; None for all cores.
         texture: the picture on the sheet, shape (height, width, 3); None for the scene's, read at the first drawing.
-        cores: number of cores for stepping; None for all. Threads spin while they wait for each other, so a thread
-            without a core delays all others.
+        cores: number of cores for stepping; None for all. Other programs on these cores slow down stepping, because its
+            threads wait for each other by spinning.
 
     Raises:
         MsmError: here and in all methods, when called in another thread than that of the first simulation or in a
@@ -90,14 +90,14 @@ class Simulation:
         texture = None if texture is None else require_texture(texture)
         self.device = runtime.start(arch, threads)
         self._plan = resolve(plan, self.device).plan
-        self._probes = self.scene.probes  # the original ones, before `steer`
+        self._original_probes = self.scene.probes  # before `steer`
         self._closed, self._cores = False, cores
         self._dynamics = build_solver(self._plan, self.device, cores=cores)
         self._reset()
         self.renderer = Renderer(self.scene, texture)
 
     def _reset(self) -> None:
-        """Start from the flat sheet; a quasi-static first frame is solved later."""
+        """Return to the flat sheet. The first frame of a quasi-static scene is solved when it is needed."""
         self._divergence: DivergedError | None = None
         self._monitor, self._force_recorder = DivergenceMonitor(self._plan), ForceRecorder(self._plan)
         self._probe_forces = self._force_recorder.at_start()
@@ -126,7 +126,7 @@ class Simulation:
 
     @property
     def inconsistent(self) -> bool:
-        """Whether the state is inconsistent after an interruption within steps; `restore` or `restart` repair it."""
+        """Whether an interruption within a step left the state inconsistent; `restore` and `restart` repair it."""
         return self._dynamics.inconsistent
 
     @property
@@ -136,7 +136,7 @@ class Simulation:
 
     @property
     def workers(self) -> int:
-        """Number of threads used for stepping while the cores are free; 0 on a GPU."""
+        """Number of threads used for stepping; 0 on a GPU. One thread steps while other programs use the cores."""
         return self._dynamics.layout.workers
 
     @property
@@ -167,11 +167,11 @@ class Simulation:
 
         Args:
             probes: one entry per probe of the scene: the probe with new values, or None for no change.
-                Force-controlled tools: a control point keeps its kind of motion (moving, jumping or fixed), so one that
-                moves later needs keyframes in `at` from the start.
+                Force-controlled tools: a fixed control point stays fixed, a moving one moving, and a jumping one
+                jumping. To move one later, give it keyframes in `at` in the scene.
                 Position-controlled tools: `{"path": [[t, across, down, height], ...]}` with times after `time`. The
                 tool moves straight from its current position to the first keyframe. Instrument, friction and grips are
-                kept by default; a grip in progress continues if the new grips contain its beginning.
+                kept by default. A grip in progress continues if the new grips have one with the same start.
 
         Raises:
             ArgumentError: when the compiled kernel does not support these probes.
@@ -184,8 +184,7 @@ class Simulation:
         plan = steer_plan(self._plan, probes, self._plan.grid.time(self.steps))
         self._dynamics.steer(plan)
         self._monitor.change_loads(plan)
-        self._force_recorder = ForceRecorder(plan)
-        self._plan, self.renderer.scene = plan, plan.scene
+        self._replace_plan(plan)
 
     def restart(self, scene: Plan | Scene | Mapping[str, Any] | None = None) -> None:
         """Return to the initial state; kernels are reused if the terms of the model and the precision are unchanged.
@@ -200,10 +199,10 @@ class Simulation:
         motion = self.scene.time.motion
         if scene is not None:
             self._plan = resolve(check_scene(scene), self.device).plan
-            self._probes = self.scene.probes
+            self._original_probes = self.scene.probes
             self.renderer.restart(self.scene)
         else:
-            self._restore_paths(self._probes)
+            self._replace_plan(with_current_paths(self._plan, self._original_probes))
         if self.scene.time.motion == motion:
             self._dynamics.restart(self._plan)
         else:
@@ -215,7 +214,7 @@ class Simulation:
         """Continue from the last frame with another material; shape, velocities, time and probes stay.
 
         Args:
-            scene: differs from the current scene in the values of `tissue`, `springs` and `damping` only.
+            scene: the current scene with other values of `tissue`, `springs` and `damping`.
 
         Raises:
             SceneError: as for `Simulation`.
@@ -224,12 +223,12 @@ class Simulation:
         before, state = self._plan, self.save().state
         plan = resolve(check_scene(scene), self.device).plan.with_probes(self.scene.probes)
         steps = self.frame * plan.grid.steps_per_frame
-        # Differences are per step, and the new stability limit may have changed the step.
+        # A difference is a displacement per step, and the step may follow from the new stability limit.
         difference = state.difference * state.difference.dtype.type(plan.grid.step / before.grid.step)
         self._dynamics.restart(plan, state._replace(steps=steps, difference=difference))
-        self._plan, self.renderer.scene = plan, plan.scene
+        self._replace_plan(plan)
         progress = replace(self.progress, energy=self._dynamics.read().energy)
-        self._monitor, self._force_recorder = DivergenceMonitor(plan, progress), ForceRecorder(plan)
+        self._monitor = DivergenceMonitor(plan, progress)
 
     def save(self) -> Snapshot:
         """Return the state from which another simulation of the scene can continue.
@@ -244,7 +243,10 @@ class Simulation:
         return self._snapshot()
 
     def restore(self, saved: Snapshot) -> None:
-        """Continue from a saved state of the same scene, also one between two frames, to the same bits.
+        """Continue from a saved state of the same scene, with the same bits as an uninterrupted simulation.
+
+        Args:
+            saved: state from `save`; it may lie between two frames.
 
         Raises:
             ArgumentError: when the state has another mesh, precision, step or number of probes.
@@ -255,14 +257,15 @@ class Simulation:
         state, per_frame = saved.state, self._plan.grid.steps_per_frame
         steps_in_frame = state.steps - saved.progress.frame * per_frame
         current = self._dynamics.displacement()
-        fits = (state.displacement.shape, state.displacement.dtype) == (current.shape, current.dtype)
-        if not (fits and len(saved.probe_forces.forces) == len(self.scene.probes) and 0 <= steps_in_frame <= per_frame):
+        same_mesh = (state.displacement.shape, state.displacement.dtype) == (current.shape, current.dtype)
+        same_probes = len(saved.probe_forces.forces) == len(self.scene.probes)
+        if not (same_mesh and same_probes and 0 <= steps_in_frame <= per_frame):
             raise ArgumentError(
                 f"saved at step {state.steps}, frame {saved.progress.frame}, {state.displacement.dtype} of shape "
                 f"{state.displacement.shape}; take a state saved with this scene's points, probes, precision and step"
             )
         if saved.probes:
-            self._restore_paths(saved.probes)
+            self._replace_plan(with_current_paths(self._plan, saved.probes))
         self._divergence = None
         self._dynamics.restart(self._plan, saved.state)
         self._frame_positions = to_positions(self._dynamics.displacement(), self.scene.sheet)
@@ -285,10 +288,10 @@ class Simulation:
         return self._probe_forces
 
     def velocities(self) -> Array:
-        """Return the velocities of the mass points half a step before `time`: the means over the last step.
+        """Return the velocities of the mass points, averaged over the last step.
 
         Returns:
-            Velocities [m/s], shape (rows, cols, 3), in the scene's precision; 0 at the start.
+            Velocities half a step before `time` [m/s], shape (rows, cols, 3), in the scene's precision; 0 at the start.
         """
         self._require_open()
         return self._dynamics.state().difference / self.positions().dtype.type(self._plan.grid.step)
@@ -298,7 +301,7 @@ class Simulation:
         return refine_surface(self.positions(), self.scene.render.refine)
 
     def diagnose(self, start: Snapshot | None = None, pause: Pause = lambda: None) -> Diagnosis:
-        """Determine why the simulation diverged in `advance`. Afterwards, call `restore` before `advance`.
+        """Find the cause of a divergence in `advance`. The simulation needs `restore` before the next `advance`.
 
         Args:
             start: an earlier state from `save`, from which the simulation is repeated; None for the initial state.
@@ -358,7 +361,7 @@ class Simulation:
     def flow(
         self, before: Labels, camera: CameraLike = None, positions: Array | None = None, time: float | None = None
     ) -> Flow:
-        """Compute the optical flow from another frame to this one, and the occlusion of that frame's pixels.
+        """Compute the optical flow from another frame to this one, and the occlusion of the other frame's pixels.
 
         Args:
             before: labels of the other frame, earlier or later, with the same picture size. If they are of another
@@ -368,7 +371,8 @@ class Simulation:
             time: as for `draw`.
 
         Returns:
-            Displacement to the right and down [px], shape (height, width, 2), and occlusion, shape (height, width).
+            Displacement of each pixel to the right and down [px], shape (height, width, 2), and its occlusion, shape
+            (height, width).
         """
         return self.renderer.flow(before, self._shot(camera, positions, time))
 
@@ -425,7 +429,7 @@ class Simulation:
             time: as for `draw`.
 
         Returns:
-            The requested outputs; None for others.
+            The outputs; None in place of those that are not requested.
         """
         return self.renderer.observe(before, self._shot(camera, positions, time))
 
@@ -456,7 +460,7 @@ class Simulation:
         return f'<figure><img alt="" src="{_jpeg_data_url(self.draw())}"><figcaption>{caption}</figcaption></figure>'
 
     def compile(self, pause: Pause = lambda: None) -> None:
-        """Compile all kernels, which otherwise happens at the first frame.
+        """Compile all kernels now instead of at the first frame.
 
         Args:
             pause: called between kernels; an exception from it stops the compilation.
@@ -466,7 +470,7 @@ class Simulation:
         pause()
         if self.scene.renders and (kernels := self.renderer.kernels()) not in _compiled_kernels:
             position = to_positions(self._dynamics.displacement(), self.scene.sheet)
-            for camera in self.scene.render.all_cameras:
+            for camera in self.scene.render.all_cameras:  # twice, as optical flow needs a previous frame
                 first = self.observe(None, camera, position)
                 self.observe(first.labels, camera, position)
             _compiled_kernels.add(kernels)
@@ -512,7 +516,7 @@ class Simulation:
         return Snapshot(self._dynamics.state(), self.progress, self._probe_forces, self.scene.probes)
 
     def _require_open(self) -> None:
-        # Kernels would write to freed memory.
+        """Raise an MsmError in another thread, or after `close`, when kernels would write to freed memory."""
         if self._closed:
             raise MsmError("this simulation is closed; build a new one")
         runtime.require_start_thread()
@@ -546,10 +550,8 @@ class Simulation:
             )
             raise self._divergence
 
-    def _restore_paths(self, probes: Sequence[Probe]) -> None:
-        """Replace steered tool paths by those of the given probes."""
-        self._plan = with_current_paths(self._plan, probes)
-        self._force_recorder, self.renderer.scene = ForceRecorder(self._plan), self.scene
+    def _replace_plan(self, plan: Plan) -> None:
+        self._plan, self.renderer.scene, self._force_recorder = plan, plan.scene, ForceRecorder(plan)
 
 
 _PLAYER_HTML = Template("""\

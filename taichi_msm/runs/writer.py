@@ -36,7 +36,7 @@ RUN_PUBLICATION = PublicationSpec(
     outputs.RUN_RECORD,
     outputs.RESULT_PATTERNS,
     lambda record: partial(outputs.is_result, set(record["outputs"]), int(record["frames"])),
-    companion=(CHECKPOINT_FOLDER, CHECKPOINT_PATTERNS),
+    unpublished=(CHECKPOINT_FOLDER, CHECKPOINT_PATTERNS),
 )
 
 
@@ -52,7 +52,7 @@ class ResultWriter:
         plan: plan of the resolved scene.
         manifest: manifest of the run for its checkpoint; None for a run that cannot be resumed.
         resumes: whether to continue from the checkpoint in the directory.
-        encode_in_subprocess: whether to encode pictures in a child process, in parallel; False: in `add`.
+        encode_in_subprocess: whether to encode pictures in a parallel child process; otherwise `add` encodes them.
 
     Raises:
         FilesError: here and in all methods, when the directory cannot be written, another run writes there, or a
@@ -108,10 +108,15 @@ class ResultWriter:
         with writing(self._directory):
             return self._checkpoint.read_positions(frame)
 
+    def read_forces(self, frame: int) -> tuple[TipForce, ...]:
+        """Read the force of every probe in a stored frame."""
+        with writing(self._directory):
+            return self._checkpoint.read_forces(frame)
+
     def add(
         self, position: NDArray[Any], observed: Mapping[str, FrameOutputs], forces: Sequence[TipForce] = ()
     ) -> None:
-        """Add the next frame. A frame of the resumed run is already in the checkpoint, and only its files are written.
+        """Add the next frame. If it is already in the checkpoint of a resumed run, only its files are written.
 
         Args:
             position: positions of the mass points [m], shape (rows, cols, 3).
@@ -121,11 +126,11 @@ class ResultWriter:
         with writing(self._directory):
             # Positions are stored first, so that an interruption never leaves a picture without positions.
             if self.stored_frames == 0:
-                self._publication.keep_companion = False
+                self._publication.keep_unpublished = False
                 self._checkpoint.begin(self._manifest or {})
             if self.frames == self.stored_frames:
                 self._checkpoint.add(position, forces)
-                self._publication.keep_companion = self._manifest is not None
+                self._publication.keep_unpublished = self._manifest is not None
             for name, labels in self._labels.items():
                 labels.add(self.frames, observed[name], position)
             if self._encoder:
@@ -168,7 +173,7 @@ class ResultWriter:
         self.finish()
         with writing(self._directory):
             results = outputs.result_names(self._scene.folders if self.frames else {})
-            # The next run into the directory recognises these files by "outputs".
+            # By "outputs", the next run into the directory recognises the files that it may replace.
             complete_record = {**record, "frames": self.frames, "outputs": results}
             text = json.dumps(complete_record, indent=2, ensure_ascii=False, allow_nan=False) + "\n"
             # File names that are not UTF-8 contain surrogates; with backslash escapes the JSON is valid.
@@ -176,7 +181,7 @@ class ResultWriter:
             self._publication.publish(outputs.file_names(results, self.frames))
             if record.get("status") == "complete":
                 self._checkpoint.invalidate()
-                self._publication.keep_companion = False
+                self._publication.keep_unpublished = False
         return complete_record
 
     def _write_trajectory(self) -> None:
@@ -224,7 +229,7 @@ class LabelWriter:
         selected = [output for name, output in OUTPUTS.items() if name in scene.folders[camera]]
         self._frame_outputs = [output for output in selected if output.source in ("labels", "flow", "stereo")]
         self._writes_camera = any(OUTPUTS[name].needs_camera for names in scene.folders.values() for name in names)
-        # Tracks stay in memory until `finish`, because their file is ordered by track.
+        # Tracks stay in memory until `finish`, as their arrays are ordered by track, not by frame.
         shape = scene.render.tracks**2 if scene.asks_for("tracks") else 0, scene.time.frames + 1
         self._pixels, self._occluded = np.empty((*shape, 2), np.float32), np.empty(shape, np.bool_)
         self._position = np.empty((*shape, 3), np.float32)
@@ -243,10 +248,10 @@ class LabelWriter:
         for output in self._frame_outputs:
             number = frame - 1 if output.is_frame_pair else frame
             if number >= 0:
-                path = self._folder / output.path(number)
+                labels, path = getattr(observed, output.source), self._folder / output.path(number)
                 path.parent.mkdir(exist_ok=True)
                 with create_file(path) as file:
-                    _LABEL_WRITERS[path.suffix](file, getattr(getattr(observed, output.source), output.name))
+                    _LABEL_WRITERS[path.suffix](file, getattr(labels, output.name))
         if observed.tracks is not None:
             self._pixels[:, frame], self._occluded[:, frame] = observed.tracks
             self._position[:, frame] = surface_positions(position, self._scene.render.refine, self._grid)
@@ -283,7 +288,7 @@ _LABEL_WRITERS: dict[str, Callable[[BinaryIO, Any], None]] = {
 
 
 class ErrorRecord(TypedDict):
-    """Error estimate of a run, relative to the largest displacement; None if unknown, for example after divergence."""
+    """Estimated errors of a run, relative to the largest displacement. Unknown ones are None, as after a divergence."""
 
     error: float | None  # largest error of any mass point in any frame, due to step and rounding; None if quasi-static
     rounding: float | None  # share of `error` due to f32; None if not separated by the companion runs
@@ -291,9 +296,9 @@ class ErrorRecord(TypedDict):
     order: int | None  # of the method; None if quasi-static
     at_least: bool  # whether `error` is a lower bound
     mesh_error: NotRequired[float | None]  # discretisation error; only with tissue
-    mesh_doubt: NotRequired[str]  # why `mesh_error` may be larger or is unknown; empty if it is reliable
+    mesh_doubt: NotRequired[str]  # reason for a larger or an unknown `mesh_error`; empty if it is reliable
     force_error: NotRequired[float | None]  # of position-controlled tools, relative to the greatest force
-    force_doubt: NotRequired[str]  # why `force_error` is unknown
+    force_doubt: NotRequired[str]  # reason for an unknown `force_error`
 
 
 class RunRecord(TypedDict, total=False):

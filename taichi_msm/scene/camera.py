@@ -28,9 +28,9 @@ from taichi_msm.scene.section import (
     scene_fault,
 )
 
-_COEFFICIENT_EXPECTS = "a number, {:g} to {:g}"
-Coefficient = Annotated[Number, Field(ge=-MAX_COEFFICIENT, le=MAX_COEFFICIENT)]
-_ANY_COEFFICIENT = _COEFFICIENT_EXPECTS.format(-MAX_COEFFICIENT, MAX_COEFFICIENT)
+_RANGE_EXPECTS = "a number, {:g} to {:g}"
+Coordinate = Annotated[Number, Field(ge=-MAX_COEFFICIENT, le=MAX_COEFFICIENT)]
+_COORDINATE_EXPECTS = _RANGE_EXPECTS.format(-MAX_COEFFICIENT, MAX_COEFFICIENT)
 
 _FOCAL_EXPECTS = "a number above 0, in pixels"
 _FOCAL_MEANING = "focal length [px]; required unless the lens model has one (scaramuzza)"
@@ -41,11 +41,12 @@ class Intrinsics(Section):
 
     fx: Positive | None = key(None, f"horizontal {_FOCAL_MEANING}", _FOCAL_EXPECTS)
     fy: Positive | None = key(None, f"vertical {_FOCAL_MEANING}", _FOCAL_EXPECTS)
-    cx: Coefficient = key(..., "x of the principal point [px]; 0 is the centre of the first pixel", _ANY_COEFFICIENT)
-    cy: Coefficient = key(..., "y of the principal point [px]; 0 is the centre of the first pixel", _ANY_COEFFICIENT)
+    cx: Coordinate = key(..., "x of the principal point [px]; 0 is the centre of the first pixel", _COORDINATE_EXPECTS)
+    cy: Coordinate = key(..., "y of the principal point [px]; 0 is the centre of the first pixel", _COORDINATE_EXPECTS)
 
 
 def _alternatives(names: Iterable[str]) -> str:
+    """Join names by commas and `or`."""
     *others, last = names
     return f"{', '.join(others)} or {last}" if others else last
 
@@ -59,12 +60,12 @@ class _Model(Section):
 
 
 def _coefficient_keys() -> dict[str, Any]:
-    """Return pydantic's fields of all coefficients; a coefficient of several lens models has the field of the first."""
+    """Return a pydantic field per coefficient; a coefficient of several lens models has that of the first model."""
     coefficients = {name: row for model in reversed(MODELS.values()) for name, row in model.coefficients.items()}
     return {
         name: (
             Annotated[Number, Field(ge=row.least, le=row.most)] | None,
-            key(row.default, row.meaning, _COEFFICIENT_EXPECTS.format(row.least, row.most)),
+            key(row.default, row.meaning, _RANGE_EXPECTS.format(row.least, row.most)),
         )
         for name, row in sorted(coefficients.items())
     }
@@ -95,7 +96,7 @@ class Distortion(_Coefficients):  # type: ignore[misc]
         coefficients = MODELS[self.model].coefficients
         for name, row in coefficients.items():
             if getattr(self, name) is None:
-                raise scene_fault(f"missing; expected {_COEFFICIENT_EXPECTS.format(row.least, row.most)}", name)
+                raise scene_fault(f"missing; expected {_RANGE_EXPECTS.format(row.least, row.most)}", name)
         for name in sorted(self.model_fields_set - {"model", *coefficients}):
             if getattr(self, name):
                 models = _alternatives(model for model, row in MODELS.items() if name in row.coefficients)
@@ -115,7 +116,7 @@ class Pose(Section):
     translation: Vector = key(..., "world origin in the camera's axes [m]", "three numbers: [x, y, z] in metres")
 
 
-# Keyframes: of a vector [t, x, y, z], of a pose [t, position, quaternion x, y, z, w]; t [s], position [m].
+# Keyframes: [t, x, y, z] of a vector; [t, x, y, z, qx, qy, qz, qw] of a pose, with a quaternion; t [s], position [m].
 VectorKeyframes = Annotated[tuple[tuple[Number, Number, Number, Number], ...], Field(min_length=1)]
 PoseRows = Annotated[
     tuple[tuple[Number, Number, Number, Number, Number, Number, Number, Number], ...], Field(min_length=1)
@@ -219,7 +220,7 @@ class Camera(Section):
         "direction that is up in the picture, or its keyframes",
         "three numbers: [x, y, z]," + _OR_KEYFRAMES,
     )
-    # f32 resolves directions to 2^-24 rad, 3.4e-6 degrees: at the minimum, about 300 rows of pixels are distinct.
+    # f32 resolves directions to 2^-24 rad, 3.4e-6 degrees: about 300 rows of pixels at the minimum.
     fov: Annotated[Number, Field(ge=0.001, lt=180)] = key(
         40.0,
         "vertical field of view, without distortion [degrees]",
@@ -228,7 +229,7 @@ class Camera(Section):
 
     @property
     def has_own_lens(self) -> bool:
-        """Whether the camera has intrinsics of its own, not those of its reference camera."""
+        """Whether the camera has its own intrinsics, in place of those of its reference camera."""
         return self.intrinsics is not None or "fov" in self.model_fields_set
 
     @property
@@ -238,7 +239,7 @@ class Camera(Section):
 
     @property
     def focal_lengths(self) -> tuple[float, float]:
-        """Focal lengths fx, fy [px]: that of the lens model, else those of `intrinsics`."""
+        """Focal lengths fx, fy [px]: those of the lens model, else of `intrinsics`."""
         assert self.intrinsics is not None
         lens_focal = self.distortion.focal_length if self.distortion else None
         focal_x, focal_y = lens_focal or self.intrinsics.fx, lens_focal or self.intrinsics.fy
@@ -256,7 +257,7 @@ class Camera(Section):
 
     @field_validator("eye", "target", "up", mode="after")
     @classmethod
-    def _check_order(cls, keyframes: Any, info: ValidationInfo) -> Any:
+    def _check_keyframes(cls, keyframes: Any, info: ValidationInfo) -> Any:
         if info.field_name == "eye" and keyframes is None and not {"beside", "pose", "poses"} & _given_before(info):
             raise scene_fault("missing; expected " + cls.model_fields["eye"].json_schema_extra["expects"])  # type: ignore
         if keyframes is not None and isinstance(keyframes[0], tuple):
@@ -311,7 +312,7 @@ class Camera(Section):
             raise scene_fault(f"{fault}; add one of them or remove distortion", "distortion")
 
     def _check_focal_length(self) -> None:
-        """Check that the focal length is in `intrinsics` or in the lens, or that both agree."""
+        """Check that the lens model or `intrinsics` has the focal length, and that two agree."""
         lens_focal = self.distortion.focal_length if self.distortion else None
         if self.intrinsics is None:
             if lens_focal is not None:
@@ -336,7 +337,7 @@ class Camera(Section):
         return type(self).model_fields.keys() - needed
 
     def with_poses(self) -> Self:
-        """Return a copy with the trajectory file replaced by its rows; the camera itself without a file."""
+        """Return a copy with the rows of the trajectory in place of its file; without a file, the camera itself."""
         if not isinstance(self.poses, str):
             return self
         try:
@@ -347,22 +348,22 @@ class Camera(Section):
         return self.model_validate(kept | {"poses": rows})
 
     def calibrated(self, size: tuple[int, int]) -> Self:
-        """Return a copy with the calibration file replaced by its intrinsics and distortion.
+        """Return a copy with the intrinsics and the distortion of the calibration in place of its file.
 
-        Pictures have `size` (width, height) [px]. Without a file, the camera itself is returned.
+        Without a file, return the camera itself. `size` is the width and height of the pictures [px].
         """
         if self.calibration is None:
             given = self.intrinsics
             if given and given.fx and given.fy and (fault := focal_fault((given.fx, given.fy), size)):
                 raise scene_fault(fault, "intrinsics")
             return self
-        # Only stereo pairs use lengths of the calibration.
+        # The unit of lengths matters only to stereo pairs.
         unit = self.calibration_unit if self.beside else "m"
         try:
             calibration = read_calibration(self.calibration, self.calibration_eye, unit)
         except CameraFileError as error:
             raise scene_fault(str(error), "calibration") from None
-        if calibration.focal and (fault := focal_fault(calibration.focal, calibration.size or size)):
+        if calibration.focal and not calibration.size and (fault := focal_fault(calibration.focal, size)):
             raise scene_fault(f"{self.calibration}: {fault}", "calibration")
         if self.scale and calibration.size is None:
             fault = "lacks the picture size, which scale needs; add image_width and image_height"
@@ -395,20 +396,22 @@ class Camera(Section):
 
     def _stereo_pose(self, calibration: Calibration) -> dict[str, Any]:
         """Return the keys rotation and translation of a stereo calibration; empty for a camera without `beside`."""
-        if self.beside is None or calibration.right is None:
-            if self.beside is not None and self.rotation is None:
-                remedy = "set calibration_eye: right for a stereo file, or add rotation and translation"
-                if self.calibration_eye == "right":
-                    remedy = "write R, 3 x 3, and T, 3 numbers, of stereoCalibrate, or add rotation and translation"
-                raise scene_fault(f"{self.calibration}: has no R and T of this camera; {remedy}", "calibration")
+        if self.beside is None:
             return {}
-        if self.rotation is not None:
-            raise scene_fault(f"conflicts with R and T of {self.calibration}; remove one of them", "rotation")
-        return calibration.right._asdict()
+        if calibration.right is not None:
+            if self.rotation is not None:
+                raise scene_fault(f"conflicts with R and T of {self.calibration}; remove one of them", "rotation")
+            return calibration.right._asdict()
+        if self.rotation is None:
+            remedy = "set calibration_eye: right for a stereo file, or add rotation and translation"
+            if self.calibration_eye == "right":
+                remedy = "write R, 3 x 3, and T, 3 numbers, of stereoCalibrate, or add rotation and translation"
+            raise scene_fault(f"{self.calibration}: has no R and T of this camera; {remedy}", "calibration")
+        return {}
 
 
 def _given_before(info: ValidationInfo) -> set[str]:
-    """Return the keys declared before the validated one that have a value, valid or not."""
+    """Return the keys before the validated one that have a value, valid or not."""
     fields = list(Camera.model_fields)
     previous = fields[: fields.index(str(info.field_name))]
     # `info.data` lacks keys with an invalid value.

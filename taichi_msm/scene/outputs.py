@@ -42,10 +42,8 @@ FORCES_HEADER = ("time", "probe", "tip_x", "tip_y", "tip_z", "force_x", "force_y
 class Output(NamedTuple):
     """An output of a run, which an entry of a scene's `output` selects."""
 
-    # Of the sources labels, flow and stereo, the name is also the field of `Labels`, `Flow` or `Stereo` to write; the
-    # suffix of `file` is the format.
-    name: str
-    file: str  # path of the file, or of the first file of a series
+    name: str  # also the field of `Labels`, `Flow` or `Stereo`, for outputs of these sources
+    file: str  # path of the file, or of the first file of a series; its suffix is the format
     source: Literal["picture", "labels", "flow", "stereo", "tracks", "positions", "forces"]
     pixel_bytes: float = 0  # largest file size per pixel, that of noise [bytes]; 0 if independent of the pixels
     needs_camera: bool = False  # whether the values are meaningful only with the camera's matrices
@@ -116,11 +114,6 @@ _ROWS = (
 )
 
 
-def zero_padded(number: int) -> str:
-    """Format the number of a run of a sweep, or of an item of an export, for the name of its file or folder."""
-    return f"{number:06}"
-
-
 OUTPUTS = {output.name: output._replace(entry=output.entry or output.name) for output in _ROWS}
 
 # Entries of `output`.
@@ -186,3 +179,8 @@ def is_result(results: Collection[str], frames: int, name: str) -> bool:
     if output is None or not number.isdecimal():
         return name in results
     return folder in results and int(number) < output.count(frames)
+
+
+def zero_padded(number: int) -> str:
+    """Format the number of a run of a sweep, or of an item of an export, for the name of its file or folder."""
+    return f"{number:06}"

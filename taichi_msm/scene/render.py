@@ -160,7 +160,7 @@ class Render(Section):
         """Follow the `baseline` of a camera to the camera that it copies.
 
         Returns:
-            The copied camera, or the camera itself without `baseline`; its distance along the x axis [m].
+            The copied camera, or the camera itself without `baseline`; and the distance from it along its x axis [m].
         """
         camera, distance = self.all_cameras[name], 0.0
         while isinstance(camera, Camera) and camera.beside is not None and camera.baseline is not None:
@@ -171,7 +171,7 @@ class Render(Section):
     def companion(self, name: str) -> str:
         """Return the name of the first camera whose `beside` is `name`, or "" without one."""
         cameras = self.all_cameras.items()
-        return next((key for key, camera in cameras if isinstance(camera, Camera) and camera.beside == name), "")
+        return next((other for other, camera in cameras if isinstance(camera, Camera) and camera.beside == name), "")
 
 
 def _read_files(camera: AnyCamera, info: ValidationInfo) -> AnyCamera:

@@ -1,4 +1,4 @@
-"""The scene, and its section `time`; each of the other modules has further sections."""
+"""The scene and its section `time`; the other modules have the other sections."""
 
 from __future__ import annotations
 
@@ -150,7 +150,7 @@ class Scene(Section):
         return folders
 
     def asks_for(self, *sources: str) -> bool:
-        """Return whether any output has one of the sources, values of `Output.source`."""
+        """Return whether any output has one of the given sources (`Output.source`)."""
         return any(OUTPUTS[name].source in sources for name in self.output)
 
     @property

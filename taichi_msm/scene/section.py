@@ -57,7 +57,7 @@ def key_problems(error: ValidationError, section: type[BaseModel], data: Any) ->
     Args:
         error: errors of the validation.
         section: model of the data.
-        data: validated data, of plain Python types.
+        data: the validated values, of plain Python types.
 
     Returns:
         Problems in the order of the errors, without duplicates at lists and unions.
@@ -74,7 +74,7 @@ class _Fault(NamedTuple):
     path: Key  # to the key at fault
     error: ErrorDetails
     kind: str  # pydantic's type of the error
-    section: type[BaseModel]  # section of the key, or, for a key that is a section, that section
+    section: type[BaseModel]  # innermost section in the path
     field: FieldInfo | None  # of the last key in the path
     branches: tuple[tuple[Key, str], ...]  # keys with a union type, each with the member that failed
 
@@ -126,21 +126,21 @@ def _section_types(annotation: Any) -> Iterator[type[BaseModel]]:
 
 
 def _choose_members(faults: Sequence[_Fault]) -> Iterator[_Fault]:
-    """For a value of a union type, keep the faults of the member that the value most probably is.
+    """Keep the faults of one member of each union type, the member with the deepest fault.
 
-    That member has the deepest fault. If two are equally deep, the value as a whole is the fault.
+    The value most probably has the type of that member. If two faults are equally deep, the whole value is at fault.
     """
     depths: dict[Key, dict[str, int]] = defaultdict(dict)
     for fault in faults:
-        for key, kind in fault.branches:
-            depths[key][kind] = max(depths[key].get(kind, 0), len(fault.path))
+        for path, member in fault.branches:
+            depths[path][member] = max(depths[path].get(member, 0), len(fault.path))
     for fault in faults:
-        for key, kind in fault.branches:
-            deepest = max(depths[key].values())
-            if list(depths[key].values()).count(deepest) > 1:
-                yield fault._replace(path=key, kind="choice")
+        for path, member in fault.branches:
+            deepest = max(depths[path].values())
+            if list(depths[path].values()).count(deepest) > 1:
+                yield fault._replace(path=path, kind="choice")
                 break
-            if depths[key][kind] != deepest:
+            if depths[path][member] != deepest:
                 break
         else:
             yield fault
@@ -258,7 +258,7 @@ class Section(BaseModel, metaclass=_SectionMeta):
     """Base class of the sections of a scene, which are immutable.
 
     Raises:
-        SceneError: when a key is unknown, missing or invalid in the constructor or in `model_copy`; at any assignment.
+        SceneError: by the constructor and `model_copy`, when a key is unknown, missing or invalid; by any assignment.
     """
 
     model_config = ConfigDict(frozen=True, extra="forbid", validate_default=True)

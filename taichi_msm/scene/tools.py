@@ -110,8 +110,8 @@ class Probe(Section):
     )
     at: tuple[SheetFraction, SheetFraction] | Annotated[tuple[PointKeyframe, ...], Field(min_length=1)] = key(
         (0.5, 0.5),
-        "control point: across from the left, as a fraction of the width, down from the top, of the height; "
-        "or its keyframes [[t, across, down], ...], linear between, constant outside",
+        "control point [across, down], as fractions of the width from the left and of the height from the top; or its "
+        "keyframes [[t, across, down], ...], linear between, constant outside",
         "[across, down], fractions from -1 to 2, or keyframes [[t, across, down], ...]",
     )
     total: Vector | None = key(
@@ -138,7 +138,7 @@ class Probe(Section):
     )
     offset: Annotated[Number, Field(ge=-50, le=1000)] = key(
         DEFAULT_OFFSET,
-        "with force only: number subtracted in the exponent of the decay, everywhere",
+        "with force only: number subtracted from the exponent of the decay, at every distance",
         "a number, -50 to 1000",
     )
     instrument: Instrument | None = key(
@@ -148,8 +148,8 @@ class Probe(Section):
     )
     friction: Literal["rough"] | NotNegative = key(
         0.0,
-        "with path: Coulomb's coefficient between the instrument and the sheet; in quasi-static scenes rough: points "
-        "that the instrument touches stick to it",
+        "with path: Coulomb's coefficient between the instrument and the sheet; or, in quasi-static scenes, rough: "
+        "points stick to the instrument at first touch",
         "a number, 0 or more, or rough",
     )
     grip: tuple[tuple[Number, Number], ...] = key(
@@ -245,9 +245,10 @@ class Probe(Section):
                 if getattr(self, name):
                     raise scene_fault(f"requires path; remove {name} from a tool with a force", name)
             return self
-        for name in sorted(_FORCE_KEYS & given):
-            if getattr(self, name) is not None:
-                raise scene_fault("requires a force, and path replaces it; remove one of them", name)
+        names = [name for name in sorted(_FORCE_KEYS & given) if getattr(self, name) is not None]
+        if names:
+            them = f"them: {', '.join(names)}" if len(names) > 1 else "one of them"
+            raise scene_fault(f"requires a force, and path replaces it; remove {them}", names[0])
         if self.instrument is None:
             raise scene_fault("missing; with path expected a mapping with radius, shaft and length", "instrument")
         return self

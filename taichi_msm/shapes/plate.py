@@ -44,7 +44,7 @@ class Plate(Shape):
         return depth
 
     def build_ray(self, operations: Operations) -> Callable[..., Any]:
-        """Build the intersection with the interval of t inside the infinite cylinder and between the ends."""
+        """Build the intersection with the infinite cylinder, limited to t between the planes of the ends."""
         sqrt, maximum, where = operations.sqrt, operations.maximum, operations.where
 
         def intersect(d_d, d_a, o_a, o_d, o_o, length, radius):

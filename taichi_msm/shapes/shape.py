@@ -45,8 +45,8 @@ class Shape(ABC):
 
         - t at the point where the line enters the shape;
         - whether it enters;
-        - `foot`, the coordinate of the axis point nearest to it [m];
-        - `end`, the sign of the normal `end` a on a flat end; 0 elsewhere, where the normal is o + t d - `foot` a.
+        - `foot`, the coordinate s of the axis point nearest to that point [m];
+        - `end`: on a flat end 1 or -1, with the normal `end` a; elsewhere 0, with the normal along o + t d - `foot` a.
         """
 
     @abstractmethod
@@ -71,7 +71,7 @@ class Shape(ABC):
 
     @abstractmethod
     def gap(self, tip: Array, axis: Array, length: float, radius: float, half: Array) -> float:
-        """Return the distance of the shape from a rectangle at z = 0 around the origin [m]; the negative depth inside.
+        """Return the distance of the shape from a rectangle at z = 0 around the origin [m]; minus the depth on contact.
 
         Args:
             tip: position of the tip [m], shape (3,).

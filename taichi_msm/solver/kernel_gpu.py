@@ -55,13 +55,14 @@ def _build_step(config: KernelConfig) -> Callable[..., None]:
     """Build the Taichi function that steps a mass point."""
     real, vector, columns, springs = config.real, config.vector, config.first_column(None), config.require(SpringTerm)
     structural, shear, open_edges = springs.structural, springs.shear, springs.open_edges
-    share_of_row, share_of_column = springs.build_shares(config)
-    along, to_other_row, of_row, of_column, of_diagonal = springs.build_spring_forces(config)
+    row_share, column_share = springs.build_cell_shares(config)
+    force_on_right, force_on_other = springs.build_spring_forces(config)
+    row_stiffness, column_stiffness, diagonal_stiffness = springs.build_stiffness(config)
     move, corrections = build_point_step(config), [term.build_correction(config) for term in config.terms]
     resolving = [correction.resolve for correction in corrections if correction]
 
     @ti.func
-    def force_on_row(sheet: ti.template(), p, q, lower, b, row_exists, up):
+    def row_force(sheet: ti.template(), p, q, lower, b, row_exists, up):
         """Return the force of entry b of row p on row q, `up` [m] above, summed in the order of the CPU kernel."""
         u, dx = [sheet.u[c][p * sheet.width + b] for c in ti.static(range(3))], sheet.constants[DX]
         force = [vector(0) for _ in ti.static(range(3))]
@@ -69,26 +70,26 @@ def _build_step(config: KernelConfig) -> Callable[..., None]:
             if ti.static(structural if right == 0 else shear):
                 k, length, exists = vector(1), ti.abs(up), vector(1)
                 if ti.static(right == 0):
-                    k *= of_column(sheet, lower, b)
-                    exists = share_of_column(sheet, exists, b)
+                    k *= column_stiffness(sheet, lower, b)
+                    exists = column_share(sheet, exists, b)
                 else:
-                    k *= of_diagonal(sheet, lower, b + ti.static(min(right, 0)))
+                    k *= diagonal_stiffness(sheet, lower, b + ti.static(min(right, 0)))
                     length = ti.sqrt(dx * dx + up * up)
                 if ti.static(right != 0 and open_edges):
                     exists = sheet.by_column[ti.static(HAS_LEFT if right < 0 else HAS_RIGHT) * sheet.width + b]
-                pull = to_other_row(sheet, q * sheet.width + b + right, right, u, up, length, k, exists * row_exists)
+                pull = force_on_other(sheet, q * sheet.width + b + right, right, u, up, length, k, exists * row_exists)
                 for c in ti.static(range(3)):
                     force[c] += pull[c]
         return force
 
     @ti.func
-    def force_on_right(sheet: ti.template(), p, i, kind, b):
+    def right_force(sheet: ti.template(), p, i, kind, b):
         """Return the force of entry b of row p, which is row i of the sheet, on its right neighbour."""
         exists, entry = vector(1), p * sheet.width + b
         if ti.static(open_edges):
             exists = sheet.by_column[HAS_RIGHT * sheet.width + b]
-        k, u = of_row(sheet, i, kind, b) * vector(1), [sheet.u[c][entry] for c in ti.static(range(3))]
-        return along(sheet, entry + 1, u, k, share_of_row(exists, kind))
+        k, u = row_stiffness(sheet, i, kind, b) * vector(1), [sheet.u[c][entry] for c in ti.static(range(3))]
+        return force_on_right(sheet, entry + 1, u, k, row_share(exists, kind))
 
     @ti.func
     def step(sheet: ti.template(), loads: ti.template(), buffer, i, b, n):
@@ -98,12 +99,12 @@ def _build_step(config: KernelConfig) -> Callable[..., None]:
         kind = ti.select(i == rows - 1, 2, ti.select(i == 0, 0, 1))
         below, above = ti.cast(i < rows - 1, real), ti.cast(i > 0, real)
         dy = sheet.constants[DY]
-        on_below = force_on_row(sheet, p, p + 1, i + 1, b, below, 0 - dy)
-        on_above = force_on_row(sheet, p, p - 1, i, b, above, dy)
+        on_below = row_force(sheet, p, p + 1, i + 1, b, below, 0 - dy)
+        on_above = row_force(sheet, p, p - 1, i, b, above, dy)
         force = [0 - (on_below[c] + on_above[c]) for c in ti.static(range(3))]
         if ti.static(structural):
-            on_right = force_on_right(sheet, p, i, kind, b)
-            of_left = force_on_right(sheet, p, i, kind, b - 1)
+            on_right = right_force(sheet, p, i, kind, b)
+            of_left = right_force(sheet, p, i, kind, b - 1)
             for c in ti.static(range(3)):
                 force[c] += of_left[c] - on_right[c]
         now = [loads[n, c] for c in ti.static(range(columns))]

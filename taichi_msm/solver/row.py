@@ -31,8 +31,9 @@ def build_pass_row(config: KernelConfig, move: Callable[..., None]) -> Callable[
     """
     vector, columns, springs = config.vector, config.first_column(None), config.require(SpringTerm)
     structural, shear, open_edges = springs.structural, springs.shear, springs.open_edges
-    share_of_row, share_of_column = springs.build_shares(config)
-    along, to_other_row, of_row, of_column, of_diagonal = springs.build_spring_forces(config)
+    row_share, column_share = springs.build_cell_shares(config)
+    force_on_right, force_on_other = springs.build_spring_forces(config)
+    row_stiffness, column_stiffness, diagonal_stiffness = springs.build_stiffness(config)
 
     @ti.func
     def pass_row(
@@ -68,12 +69,12 @@ def build_pass_row(config: KernelConfig, move: Callable[..., None]) -> Callable[
             has_right = sheet.by_column[HAS_RIGHT * width + 0]
         u = [sheet.u[c][row] for c in ti.static(range(3))]
         if ti.static(structural):
-            first = along(sheet, row + 1, u, of_row(sheet, i, kind, 0), share_of_row(has_right, kind))
+            first = force_on_right(sheet, row + 1, u, row_stiffness(sheet, i, kind, 0), row_share(has_right, kind))
             for c in ti.static(range(3)):
                 left[c] = first[c]
         if ti.static(shear):
-            first_right = to_other_row(
-                sheet, next_at + 1, 1, u, up, diagonal, of_diagonal(sheet, lower, 0), has_right * exists
+            first_right = force_on_other(
+                sheet, next_at + 1, 1, u, up, diagonal, diagonal_stiffness(sheet, lower, 0), has_right * exists
             )
             for c in ti.static(range(3)):
                 following[c] = first_right[c]
@@ -90,23 +91,24 @@ def build_pass_row(config: KernelConfig, move: Callable[..., None]) -> Callable[
             if ti.static(open_edges):
                 has_left, has_right = sheet.by_column[HAS_LEFT * width + b], sheet.by_column[HAS_RIGHT * width + b]
             if ti.static(shear):
-                to_left = to_other_row(
-                    sheet, next_at + b - 1, -1, u, up, diagonal, of_diagonal(sheet, lower, b - 1), has_left * exists
-                )
+                to_left = force_on_other(
+                    sheet, next_at + b - 1, -1, u, up, diagonal, diagonal_stiffness(sheet, lower, b - 1),
+                    has_left * exists,
+                )  # fmt: skip
                 for c in ti.static(range(3)):
                     force[c] = to_left[c]
                     last[c] += to_left[c]
             if ti.static(structural):
-                straight = to_other_row(
-                    sheet, next_at + b, 0, u, up, ti.abs(up), of_column(sheet, lower, b),
-                    share_of_column(sheet, exists, b),
+                straight = force_on_other(
+                    sheet, next_at + b, 0, u, up, ti.abs(up), column_stiffness(sheet, lower, b),
+                    column_share(sheet, exists, b),
                 )  # fmt: skip
                 for c in ti.static(range(3)):
                     force[c] += straight[c]
                     this[c] += straight[c]
             if ti.static(shear):
-                to_right = to_other_row(
-                    sheet, next_at + b + 1, 1, u, up, diagonal, of_diagonal(sheet, lower, b), has_right * exists
+                to_right = force_on_other(
+                    sheet, next_at + b + 1, 1, u, up, diagonal, diagonal_stiffness(sheet, lower, b), has_right * exists
                 )
                 for c in ti.static(range(3)):
                     force[c] += to_right[c]
@@ -114,7 +116,9 @@ def build_pass_row(config: KernelConfig, move: Callable[..., None]) -> Callable[
             for c in ti.static(range(3)):
                 force[c] = carried[c][carry + b] - force[c]
             if ti.static(structural):
-                right = along(sheet, row + b + 1, u, of_row(sheet, i, kind, b), share_of_row(has_right, kind))
+                right = force_on_right(
+                    sheet, row + b + 1, u, row_stiffness(sheet, i, kind, b), row_share(has_right, kind)
+                )
                 for c in ti.static(range(3)):
                     force[c] += left[c] - right[c]
                     left[c] = right[c]
@@ -129,8 +133,8 @@ def build_pass_row(config: KernelConfig, move: Callable[..., None]) -> Callable[
                 has_left = sheet.by_column[HAS_LEFT * width + strip + 1]
             for c in ti.static(range(3)):
                 u[c] = sheet.u[c][row + strip + 1]
-            end = to_other_row(
-                sheet, next_at + strip, -1, u, up, diagonal, of_diagonal(sheet, lower, strip), has_left * exists
+            end = force_on_other(
+                sheet, next_at + strip, -1, u, up, diagonal, diagonal_stiffness(sheet, lower, strip), has_left * exists
             )
             for c in ti.static(range(3)):
                 this[c] += end[c]

@@ -1,4 +1,4 @@
-"""Formatting of measurements: numbers, times, errors and tables, for the page, the terminal and the picture."""
+"""Formatting of measurements for the report of a study: numbers, times, errors and tables."""
 
 from __future__ import annotations
 
@@ -8,22 +8,22 @@ from typing import Any
 
 from taichi_msm.study.result import MeshMeasurement, SteppingMeasurement, Study, Timing
 
-# Units of time: number of units per second, and name.
+# Units of time: number per second, and name.
 TIME_UNITS = ((1, "s"), (1e3, "ms"), (1e6, "us"))
 
 Columns = Mapping[str, Callable[[Any], str]]
 
-# A measurement with an error.
+# Measurements that have an error.
 ErrorMeasurement = SteppingMeasurement | MeshMeasurement
 
 
 def format_number(value: float) -> str:
-    """Format a measured value with three significant digits."""
+    """Format a measured value with three significant digits; from 1000 to a million as a whole number."""
     return f"{value:.0f}" if 999.5 <= abs(value) < 1e6 else f"{value:#.3g}".rstrip(".")
 
 
 def time_unit(seconds: float) -> tuple[float, str]:
-    """Choose a readable unit of time for a duration [s].
+    """Choose the unit of time for a duration [s].
 
     Returns:
         Number of units per second, and name of the unit.
@@ -32,13 +32,13 @@ def time_unit(seconds: float) -> tuple[float, str]:
 
 
 def format_duration(seconds: float) -> str:
-    """Format a time with its unit."""
+    """Format a time [s] with its unit."""
     scale, name = time_unit(seconds)
     return f"{format_number(seconds * scale)} {name}"
 
 
 def format_timing(timing: Timing) -> str:
-    """Format a median and its range in one unit."""
+    """Format the median of times, and their range in the same unit."""
     scale, _ = time_unit(timing.median)
     range_text = "once"
     if timing.runs > 1:
@@ -47,12 +47,12 @@ def format_timing(timing: Timing) -> str:
 
 
 def comparable_error(measurement: ErrorMeasurement) -> float:
-    """Return the error; infinite if the simulation diverged."""
+    """Return the error for comparisons; infinite if the simulation diverged."""
     return math.inf if measurement.error is None or math.isnan(measurement.error) else measurement.error
 
 
 def format_error(measurement: ErrorMeasurement) -> str:
-    """Format the error, or its bound."""
+    """Format the error; with < if it is an upper bound."""
     error = comparable_error(measurement)
     return f"{'' if measurement.known else '< '}{format_number(error)}" if error < math.inf else "diverged"
 
@@ -91,12 +91,12 @@ def markdown_table(head: Sequence[str], rows: Sequence[Sequence[str]], left_colu
 
 
 def format_table(measurements: Sequence[Any], columns: Columns, remark: Callable[[Any], str] | None = None) -> str:
-    """Format measurements as a Markdown table, one per row.
+    """Format measurements as a Markdown table, with a row for each.
 
     Args:
         measurements: measurements of one kind.
-        columns: format functions of the cells, by the name of the column.
-        remark: format function of an unnamed last column, omitted if all its cells are empty.
+        columns: format functions of cells, by the name of the column.
+        remark: format function of an unnamed last column, which is left out if empty; None for no such column.
 
     Returns:
         The table, without a final line break.

@@ -31,23 +31,17 @@ from taichi_msm.scene.scene import Scene
 from taichi_msm.scene.section import MAX_POINTS
 from taichi_msm.solver.dynamics import Dynamics
 from taichi_msm.solver.planning import min_stable_steps, plan_variant, try_plan, with_time
-from taichi_msm.study.result import (
-    DrawingMeasurement,
-    MeshMeasurement,
-    Reference,
-    SteppingMeasurement,
-    Study,
-)
+from taichi_msm.study.result import DrawingMeasurement, MeshMeasurement, Reference, SteppingMeasurement, Study
 from taichi_msm.system import process
 from taichi_msm.system.runtime import Device
 
 PRECISIONS: tuple[Precision, ...] = ("f64", "f32")
 DIFFERENCES = ("central", "backward")
 
-# Number of timings of every setting; all settings of a kind are timed in turns.
+# Number of timings of every setting, in turns with the other settings of its kind.
 ROUNDS = 5
 
-# Smallest ratio of a known error to the error of the reference.
+# Smallest ratio of a measured error to the error of the reference; a smaller error is only a bound.
 REFERENCE_MARGIN = 20
 
 Array = NDArray[Any]
@@ -60,8 +54,8 @@ class SteppingStudy:
         plan: plan of the scene.
         device: device of the simulations.
         longest_run: approximate time limit of a run [s].
-        study: receives the results, with those before a KeyboardInterrupt from `progress`.
-        progress: called with the number of finished runs and their total.
+        study: receives the results; keeps the first ones after a KeyboardInterrupt from `progress`.
+        progress: called with the finished and the total number of runs.
     """
 
     def __init__(
@@ -77,7 +71,7 @@ class SteppingStudy:
         self._done, self._total = 0, 1
 
     def run(self) -> Array:
-        """Compute the reference and the errors, then repeat all runs to measure their times.
+        """Compute the reference and the errors, then repeat every run to measure its time.
 
         Returns:
             Reference displacements at every frame but the first [m], shape (F, rows, cols, 3).
@@ -103,45 +97,45 @@ class SteppingStudy:
         return frames
 
     def _series(self, difference: str) -> Iterator[int]:
-        """Yield the steps per frame: the smallest valid number, then its doubles up to the time limit of a run."""
+        """Yield the steps per frame: the smallest stable number, then doubled ones, up to the time limit of a run."""
         steps = min_steps_per_frame(self._plan.tools, self._plan.grid, min_stable_steps(self._plans[difference]))
         samples: list[float] = []
         self._run("f64", difference, steps, samples)
         yield steps
         for halving in range(1, 64):
-            # Two halvings are measured regardless of the time limit.
+            # The first two halvings of the step ignore the time limit.
             if halving > 2 and samples[0] * 2**halving > self._longest_run:
                 return
             yield steps * 2**halving
 
     def _compute_reference(self, finest: int) -> Array:
         """Extrapolate central differences with one half and one quarter of the finest measured step."""
-        # u* = u_{h/2} + (u_{h/2} - u_h) / 3. The distance of u* from the same formula at 2 h bounds its error, roughly.
-        # Contact is of order 1: the finest run is then the reference.
+        # Richardson: u* = u_{h/2} + (u_{h/2} - u_h) / 3, whose error is roughly bounded by its distance from the same
+        # formula at 2 h. With contact, of order 1, the finest run is the reference.
         coarse, middle, fine = (self._run("f64", "central", finest * 2**halving, []) for halving in range(3))
         before, frames = middle + (middle - coarse) / 3, fine + (fine - middle) / 3
         if self._plan.tools:
             before, frames = middle, fine
         largest = max_norm(frames)
-        self._study.reference = Reference(4 * finest, _relative(frames - before, largest), largest)
+        self._study.reference = Reference(4 * finest, _relative_error(frames - before, largest), largest)
         return frames
 
     def _measure_errors(self, difference: str, counts: list[int], exact: Array) -> None:
-        """Run every step once: in f32 until rounding dominates, in f64 until the reference is too inaccurate."""
+        """Run every step once: in f32 until rounding dominates, in f64 until errors are only bounds."""
         assert self._study.reference is not None
         largest, reference_error = self._study.reference.largest, self._study.reference.error
         remaining, bound = set(PRECISIONS), displacement_bound(self._plan, self._plan.scene.time.duration)
         for steps in counts:
-            double: Array | None = None
+            frames_f64: Array | None = None
             for precision in (each for each in PRECISIONS if each in remaining):
                 step = replace(self._plan.grid, steps_per_frame=steps).step
                 point = SteppingMeasurement(precision, difference, steps, step)
                 frames = self._run(precision, difference, steps, point.samples)
-                error, rounding = _relative(frames - exact, largest), None
+                error, rounding = _relative_error(frames - exact, largest), None
                 if precision == "f64":
-                    double = frames
-                elif double is not None and largest > 0:
-                    rounding = max_norm(frames - double) / largest
+                    frames_f64 = frames
+                elif frames_f64 is not None and largest > 0:
+                    rounding = max_norm(frames - frames_f64) / largest
                 self._study.stepping.append(point)
                 if error < math.inf and max_norm(frames) <= bound:
                     point.error, point.rounding = error, rounding
@@ -150,7 +144,7 @@ class SteppingStudy:
                         remaining.discard(precision)
 
     def _run(self, precision: str, difference: str, steps: int, samples: list[float]) -> Array:
-        """Simulate the scene, append the time without copies [s] to the samples, and return the frames."""
+        """Simulate the scene, append the time of stepping [s] to the samples, and return the frames."""
         dynamics = self._dynamics[precision]
         plan = self._plans[difference].with_grid(precision=precision, steps_per_frame=steps)
         dynamics.restart(plan)
@@ -167,8 +161,8 @@ class SteppingStudy:
         return frames
 
 
-def _relative(error: Array, largest: float) -> float:
-    """Return the largest error as a fraction of the largest displacement [m]; 0 without motion."""
+def _relative_error(error: Array, largest: float) -> float:
+    """Return the largest error [m] as a fraction of the largest displacement [m]; 0 without motion."""
     return max_norm(error) / largest if largest > 0 else 0.0
 
 
@@ -185,18 +179,18 @@ class _MeshRun(NamedTuple):
 class MeshStudy:
     """Work-precision diagram of the mesh of a sheet of tissue, in f64.
 
-    Errors are measured with one step for all meshes, so that the time-step errors cancel; times with the automatic step
-    of each mesh, which is longer for coarser ones.
+    Errors are measured with the same step for all meshes, so that time-step errors cancel, and times with the automatic
+    step of each mesh, which is longer for a coarser one.
 
-    The reference has a mesh finer than all measured ones, if one run of it takes at most the time limit of all timed
-    runs of a mesh. Otherwise it ends at the finest measured mesh, whose own error is then only a bound.
+    The reference is extrapolated from a mesh finer than all measured ones if a run of it takes at most `ROUNDS` times
+    `longest_run`, otherwise from the finest measured mesh, whose own error is then only a bound.
 
     Args:
-        plan: of the scene.
-        device: runs the simulations.
+        plan: plan of the scene.
+        device: device of the simulations.
         longest_run: approximate time limit of a run [s].
-        study: receives the results, from coarse to fine, also those before a KeyboardInterrupt from `progress`.
-        progress: called with the number of finished runs and their total.
+        study: receives the results from coarse to fine; keeps the first ones after a KeyboardInterrupt from `progress`.
+        progress: called with the finished and the total number of runs.
     """
 
     def __init__(
@@ -209,7 +203,7 @@ class MeshStudy:
         self._done = 0
 
     def run(self) -> None:
-        """Compute the errors, then measure the times; skip sheets of springs, whose stiffness depends on the mesh."""
+        """Compute the errors, then measure the times; do nothing for springs, whose stiffness depends on the mesh."""
         if self._plan.scene.tissue is None:
             return
         with ExitStack() as opened:
@@ -217,13 +211,13 @@ class MeshStudy:
             for plan in mesh_plans(self._plan):
                 seconds = self._measure_mesh(plan, opened)
             if not self._sheets:
-                note = f"points were not measured: a comparison needs at least {MIN_POINTS_PER_SIDE} a side"
+                note = f"meshes were not compared: that takes at least {MIN_POINTS_PER_SIDE} points a side"
                 self._study.notes.append(note)
                 return
             finer = self._finer_plan(self._plan, seconds, self._longest_run)
             if finer is None:
                 rows, cols = _scaled(self._plan, FINE_CELL_RATIO)
-                self._study.notes.append(f"{rows} x {cols} points were not measured: time or memory")
+                self._study.notes.append(f"{rows} x {cols} points were not measured, for lack of time or memory")
             else:
                 seconds = self._measure_mesh(finer, opened)
                 finer = self._finer_plan(finer, seconds, ROUNDS * self._longest_run)
@@ -235,18 +229,18 @@ class MeshStudy:
                     sheet.measurement.samples.append(self._step_through(sheet))
 
     def _measure_mesh(self, plan: Plan, opened: ExitStack) -> float:
-        """Add a mesh; return the time of its automatic steps [s]."""
+        """Add a mesh; return the time of a run with its automatic step [s]."""
         dynamics = opened.enter_context(closing(Dynamics(plan, self._device)))
         sheet = _MeshRun(plan, dynamics, MeshMeasurement(*plan.scene.sheet.points, plan.grid.steps_per_frame))
         self._sheets.append(sheet)
         self._study.points.append(sheet.measurement)
         self._tick()
         dynamics.compile()
-        # The minimum of two runs is less sensitive to other load on the machine.
+        # The minimum of two runs is less sensitive to other load of the machine.
         return min(self._step_through(sheet) for _ in range(2))
 
     def _finer_plan(self, plan: Plan, seconds: float, longest_run: float) -> Plan | None:
-        """Plan the next finer mesh after one that took `seconds`; None beyond the limit of points, time or memory."""
+        """Plan the mesh finer than one whose run took `seconds`; None beyond the limits of points, time and memory."""
         points = _scaled(plan, FINE_CELL_RATIO)
         if max(points) > MAX_POINTS:
             return None
@@ -255,7 +249,7 @@ class MeshStudy:
         return None if seconds * work[1] / work[0] > longest_run or any(cost.size_problems(finer)) else finer
 
     def _measure_errors(self, finer: Plan | None) -> None:
-        """Step all meshes, and the finer one if given, in lockstep, and compare every frame."""
+        """Step all meshes in lockstep, with the finer one unless None, and compare every frame."""
         finest = self._sheets[-1].plan if finer is None else finer
         grid = finest.grid
         with ExitStack() as opened:
@@ -274,8 +268,8 @@ class MeshStudy:
                 with np.errstate(all="ignore"):
                     exact, bound = _reference(fields, extrapolate=not finest.tools)
                     frame_errors = [max_norm(interpolate(field, exact) - exact) for field in fields[:-1]]
-                    # The error of the finest mesh between its mass points is unknown. At an order of at least 1, the
-                    # distance from a mesh with half the cells per side bounds it.
+                    # The error of the finest mesh between its points is not measured. At order 1 or more, its distance
+                    # from a mesh with half the cells per side is a bound.
                     frame_errors.append(max_norm(interpolate(fields[-2], fields[-1]) - fields[-1]))
                 errors = [max(pair) for pair in zip(errors, frame_errors, strict=True)]
                 reference_error, largest = max(reference_error, bound), max(largest, max_norm(exact))
@@ -304,12 +298,12 @@ class MeshStudy:
         return seconds
 
     def _tick(self) -> None:
-        # Per mesh two first runs and `ROUNDS` timed ones; the comparison of all meshes counts as one run.
+        # A mesh has two first runs and `ROUNDS` timed ones; the comparison of all meshes counts as a run.
         self._progress(self._done, 1 + (2 + ROUNDS) * len(self._sheets))
 
 
 def mesh_plans(plan: Plan) -> Iterator[Plan]:
-    """Yield the plans of valid coarser meshes, from coarse to fine, then that of the scene's own mesh."""
+    """Yield the plans of valid coarser meshes, from coarse to fine, and of the scene's own mesh."""
     for ratio in (1 / 4, 1 / 2):
         points = _scaled(plan, ratio)
         coarse, _ = (
@@ -322,17 +316,17 @@ def mesh_plans(plan: Plan) -> Iterator[Plan]:
 
 
 def _scaled(plan: Plan, ratio: float) -> tuple[int, int]:
-    """Return the rows and columns of mass points for `ratio` times the cells per side."""
+    """Return the rows and columns of mass points of a mesh with `ratio` times the cells per side."""
     rows, cols = (round((count - 1) * ratio) + 1 for count in plan.scene.sheet.points)
     return rows, cols
 
 
 def _reference(fields: list[Array], *, extrapolate: bool) -> tuple[Array, float]:
     """Return Richardson's extrapolation of order 2 of the two finest fields, and a bound of its error [m]."""
-    # u* = u + (u - u_r) / (r^2 - 1), where u_r has cells r times as long. The correction is computed at the mass points
-    # of u_r and interpolated at those of u. The rough bound is the distance of u* from the extrapolation of the next
-    # coarser pair, or from u if there are only two fields. Contact is of order 1: u is then the reference, and its
-    # distance from u_r the rough bound.
+    # u* = u + (u - u_r) / (r^2 - 1), where the cells of u_r are r times as long. The correction is computed at the mass
+    # points of u_r and interpolated at those of u. The rough bound is the distance of u* from the extrapolation of the
+    # next coarser pair, or from u without a third field. With contact, of order 1, u is the reference, and its distance
+    # from u_r the rough bound.
     if not extrapolate:
         return fields[-1], max_norm(interpolate(fields[-1], fields[-2]) - fields[-2])
     exact = fields[-1] + interpolate(_correction(fields[-1], fields[-2]), fields[-1])
@@ -356,7 +350,7 @@ def _correction(fine: Array, coarse: Array) -> Array:
 REFINES = (0, 1, 2, 5, 10, 20)
 SUPERSAMPLES = (1, 2, 3, 4)
 
-# Settings of the reference picture, finer than all others.
+# Settings of the reference picture, finer than all compared ones.
 REFERENCE_RENDER = {"refine": 40, "supersample": 8}
 
 Picture = NDArray[np.uint8]
@@ -365,7 +359,7 @@ Picture = NDArray[np.uint8]
 def measure_pictures(
     scene: Scene, position: NDArray[Any], texture: Picture, quick: bool, study: Study, progress: ProgressCallback
 ) -> None:
-    """Measure the error and the time of drawing with every setting.
+    """Measure the error and the time of drawing with every refinement and supersampling.
 
     Args:
         scene: the scene.
@@ -373,13 +367,13 @@ def measure_pictures(
         texture: picture on the sheet, 8-bit RGB, shape (height, width, 3).
         quick: whether to vary only one of refinement and supersampling at a time.
         study: receives the results.
-        progress: called with the number of finished pictures and their total.
+        progress: called with the finished and the total number of pictures.
     """
     position = np.ascontiguousarray(position, np.float32)
     memory = process.available_memory() // 2
     finest = _with_render(scene, **REFERENCE_RENDER)
     if cost.drawing_bytes(finest) > memory:
-        study.notes.append("drawing was not measured: the memory is too small for the reference picture")
+        study.notes.append("drawing was not measured, for lack of memory for the reference picture")
         return
     reference = Rasterizer(finest, texture).draw(position)
     drawings, candidates = [], list(render_settings(scene, quick))
@@ -388,7 +382,9 @@ def measure_pictures(
         changed = _with_render(scene, refine=refine, supersample=supersample)
         memory -= cost.drawing_bytes(changed)
         if memory < 0:
-            study.notes.append(f"drawing was not measured from refine {refine}, supersample {supersample} on: memory")
+            study.notes.append(
+                f"drawing was not measured from refine {refine}, supersample {supersample} on, for lack of memory"
+            )
             break
         drawing = Rasterizer(changed, texture)
         drawings.append(drawing)
@@ -422,7 +418,7 @@ def psnr(picture: Picture, reference: Picture) -> float | None:
 
     Args:
         picture: 8-bit RGB, shape (height, width, 3).
-        reference: of the same shape.
+        reference: picture of the same shape.
 
     Returns:
         The ratio [dB]; None if both pictures are equal.

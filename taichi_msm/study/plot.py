@@ -45,24 +45,10 @@ PRECISION_LINES: dict[str, dict[str, Any]] = {
     "f64": {"linestyle": (0, (3.5, 1.8)), "marker": "s"},
 }
 TOLERANCE_LINE: dict[str, Any] = {"color": GREY, "linewidth": 0.8, "linestyle": (0, (6, 3))}
-RECOMMENDED_MARKER: dict[str, Any] = {
-    "ls": "none",
-    "marker": "o",
-    "ms": 11,
-    "mfc": "none",
-    "mec": INK,
-    "zorder": 5,
-}
+RECOMMENDED_MARKER: dict[str, Any] = {"ls": "none", "marker": "o", "ms": 11, "mfc": "none", "mec": INK, "zorder": 5}
 BOUND_MARKER: dict[str, Any] = {"mfc": "white"}
 LEGEND_MARKER: dict[str, Any] = {"linestyle": "none", "marker": "o", "color": GREY}
-SUPERSAMPLE_COLOURS = (
-    SKY,
-    BLUE,
-    GREEN,
-    ORANGE,
-    PURPLE,
-    VERMILION,
-)
+SUPERSAMPLE_COLOURS = (SKY, BLUE, GREEN, ORANGE, PURPLE, VERMILION)
 MARKERS = "osD^vPX"
 
 # Mosaic by the number of panels.
@@ -75,8 +61,8 @@ def plot(study: Study, path: Path) -> None:
     """Plot the measured parts of a study.
 
     Args:
-        study: results with at least one of the `panels`.
-        path: the PNG file.
+        study: results with data for at least one panel.
+        path: path of the PNG.
     """
     with style.context(STYLE, after_reset=True), warnings.catch_warnings():
         # The name of a scene may contain characters that the font lacks.
@@ -85,7 +71,7 @@ def plot(study: Study, path: Path) -> None:
 
 
 def panels(study: Study) -> Iterator[Panel]:
-    """Yield the plot functions of the panels with drawable data."""
+    """Yield the plot function of each panel that has data to plot."""
     if any(_drawable(point.error) for point in study.stepping):
         yield _plot_stepping
     if any(_drawable(drawing.psnr) for drawing in study.drawing):
@@ -95,7 +81,7 @@ def panels(study: Study) -> Iterator[Panel]:
 
 
 def _drawable(value: float | None) -> bool:
-    """Return whether a logarithmic axis can represent a value."""
+    """Return whether a value is on a logarithmic axis."""
     return value is not None and 0 < value < math.inf
 
 
@@ -108,9 +94,9 @@ def _figure(study: Study) -> Figure:
     )
     figure = Figure(figsize=size, dpi=DPI, layout=ConstrainedLayoutEngine(w_pad=0.1, h_pad=0.1, wspace=0.05))
     FigureCanvasAgg(figure)
-    versions = study.machine["versions"]
     state = " (interrupted)" if study.status == "interrupted" else ""
     figure.suptitle(f"{printable(study.scene)}: speed against error{state}", x=0.01, ha="left", parse_math=False)
+    versions = study.machine["versions"]
     machine = f"{machine_summary(study)}; taichi-msm {versions['taichi-msm']}, {compiler_label(versions)}"
     figure.supxlabel(
         f"{_recommendation_line(study)}\n{machine}", x=0.01, ha="left", size=8, parse_math=False, wrap=True
@@ -159,7 +145,7 @@ def _plot_line(axes: Axes, points: Sequence[ErrorMeasurement], line: dict[str, A
 
 
 def _marker_legend(study: Study) -> Iterator[Line2D]:
-    """Yield the legend handles of the plotted kinds of markers."""
+    """Yield a legend handle for each kind of marker in the panel of stepping."""
     yield Line2D([], [], **TOLERANCE_LINE, label="tolerance")
     if study.best_stepping is not None:
         yield Line2D([], [], **RECOMMENDED_MARKER | {"ms": 8}, label="recommended")
@@ -220,7 +206,7 @@ def _plot_times(
     line: dict[str, Any],
     scale: float = 1,
 ) -> None:
-    """Plot a line through the medians of the times, with thin bars from the fastest to the slowest."""
+    """Plot a line through the medians of the times, and thin bars from the fastest to the slowest time."""
     times = [point.seconds for point in points]
     axes.plot(x, [scale * each.median for each in times], **line, zorder=3)
     fastest, slowest = [scale * each.fastest for each in times], [scale * each.slowest for each in times]
@@ -254,7 +240,7 @@ def _scale(axes: Axes, axis: str, values: Iterable[float], min_decades: float) -
 
 
 def _legend(axes: Axes, handles: Sequence[Line2D], columns: int = 2) -> None:
-    """Add a legend of the panel's width below the panel and its label."""
+    """Add a legend below the panel and its label, as wide as the panel."""
     figure = axes.figure
     assert isinstance(figure, Figure)
     axes.legend(

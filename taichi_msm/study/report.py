@@ -1,4 +1,4 @@
-"""Report of a study: JSON, a page in Markdown, a figure, and a summary for the terminal."""
+"""Report of a study: JSON, a page in Markdown, a figure, and the summary for the terminal."""
 
 from __future__ import annotations
 
@@ -23,13 +23,7 @@ from taichi_msm.study.format import (
     format_timing,
     machine_summary,
 )
-from taichi_msm.study.result import (
-    DrawingMeasurement,
-    Measurement,
-    Reference,
-    SteppingMeasurement,
-    Study,
-)
+from taichi_msm.study.result import DrawingMeasurement, Measurement, Reference, SteppingMeasurement, Study
 from taichi_msm.system.compiler import compiler_label
 
 PICTURE_FILE, PAGE_FILE, RECORD_FILE = "study.png", "study.md", "study.json"
@@ -38,26 +32,20 @@ WITHOUT_MATPLOTLIB = "study.png needs matplotlib: pip install matplotlib"
 
 
 def require_writable(directory: Path) -> None:
-    """Check that a directory can be written.
-
-    Raises:
-        FilesError: when it cannot be written.
-    """
+    """Raise a FilesError if a directory cannot be written."""
     with writing(directory), hidden_folder(directory):
         pass
 
 
 def write_report(study: Study, directory: Path) -> list[str]:
-    """Write the report of a study, replacing an earlier one; other files in the directory remain.
-
-    Every file is written atomically, study.json last.
+    """Write the report of a study, in place of an earlier one; other files in the directory remain.
 
     Args:
         study: the results; receives a note if the figure cannot be plotted.
         directory: directory of the report.
 
     Returns:
-        Names of the files, study.json last.
+        Names of the files, each written atomically, study.json last.
 
     Raises:
         FilesError: when the directory cannot be written.
@@ -96,7 +84,7 @@ def _as_data(value: Any) -> Any:
 
 
 def _draw(study: Study, path: Path) -> bool:
-    """Plot the figure if Matplotlib is installed and a panel has data; return whether it was plotted."""
+    """Plot the figure if Matplotlib is installed and there are data to plot; return whether it was plotted."""
     try:
         from taichi_msm.study.plot import panels, plot
     except ImportError:
@@ -146,7 +134,7 @@ def format_page(study: Study) -> str:
         f"Measured on {machine_summary(study)}, with taichi-msm {versions['taichi-msm']}, {compiler_label(versions)}, "
         f"NumPy {versions['numpy']} and Python {versions['python']} ({versions['platform']}). "
         "Times are medians, with the fastest and the slowest in brackets.",
-        *(_stepping(study) if study.stepping else ()),
+        *(_stepping_section(study) if study.stepping else ()),
     ]
     if study.drawing:
         blocks += [
@@ -156,7 +144,7 @@ def format_page(study: Study) -> str:
             _drawings_table(study, study.drawing),
         ]
     if study.points:
-        blocks += _meshes(study)
+        blocks += _mesh_section(study)
     if study.notes:
         blocks += ["## Notes", "\n".join(f"- {note}" for note in study.notes)]
     blocks += ["## Recommendation", *remarks(study)]
@@ -166,7 +154,7 @@ def format_page(study: Study) -> str:
 
 
 def format_summary(study: Study) -> str:
-    """Format the main results for the terminal, followed by the recommended lines of a scene file."""
+    """Format the main results, and the recommended lines of a scene file, for the terminal."""
     lines = [f"{printable(study.scene)} on {machine_summary(study)}"]
     if study.reference is not None:
         lines.append(
@@ -186,7 +174,7 @@ def format_summary(study: Study) -> str:
     if study.points:
         blocks.append(_meshes_table(study))
     notes = [f"note: {printable(note)}" for note in study.notes]
-    if remark_lines := [*notes, *_bounds([*fastest, *study.points]), *remarks(study)]:
+    if remark_lines := [*notes, *_explain_bounds([*fastest, *study.points]), *remarks(study)]:
         blocks.append("\n".join(remark_lines))
     if recommended := study.recommendation():
         blocks += ["Recommended settings of the scene:", "\n".join(recommended)]
@@ -194,10 +182,10 @@ def format_summary(study: Study) -> str:
 
 
 def remarks(study: Study) -> Iterator[str]:
-    """Yield remarks on the recommendation and on the discretisation error (mesh)."""
+    """Yield remarks on a missing step and on the discretisation error of the mesh."""
     mesh, recommended = study.scene_mesh, study.recommended_points
     if recommended is None and study.best_stepping is None:
-        yield _shortfall(study)
+        yield _explain_shortfall(study)
     if mesh is None:
         return
     bound = f"{'' if mesh.known else 'at most about '}{format_number(mesh.error or 0.0)}"
@@ -210,7 +198,7 @@ def remarks(study: Study) -> Iterator[str]:
     points = f"{rows} x {cols}"
     if max(recommended) > MAX_POINTS:
         advice = (
-            f"About {points} would be within it, and a scene may have {MAX_POINTS} a side: take a wider "
+            f"About {points} would be within it, more than the {MAX_POINTS} a side of a scene: take a wider "
             "tool (probes.N.radius, a smaller falloff), or allow a larger error with --tolerance."
         )
     else:
@@ -223,8 +211,8 @@ def remarks(study: Study) -> Iterator[str]:
     )
 
 
-def _shortfall(study: Study) -> str:
-    """Return the reason why no step is recommended, and a remedy."""
+def _explain_shortfall(study: Study) -> str:
+    """Return the reason why no step is recommended, and the remedy."""
     closest = _best(study.stepping, study.tolerance)
     if closest is None:
         return "No step is recommended: none was measured."
@@ -240,7 +228,7 @@ def _shortfall(study: Study) -> str:
     )
 
 
-def _stepping(study: Study) -> Iterator[str]:
+def _stepping_section(study: Study) -> Iterator[str]:
     yield "## Stepping"
     if (reference := study.reference) is not None:
         extrapolated = ", not extrapolated as contact is of order 1," if study.has_contact else ", extrapolated,"
@@ -254,10 +242,10 @@ def _stepping(study: Study) -> Iterator[str]:
     orders = [f"{method} {order:.2f}" for method, order in study.orders.items() if order is not None]
     if orders:
         yield f"Observed orders: {', '.join(orders)}."
-    yield from _bounds(study.stepping)
+    yield from _explain_bounds(study.stepping)
 
 
-def _meshes(study: Study) -> Iterator[str]:
+def _mesh_section(study: Study) -> Iterator[str]:
     yield "## Points"
     reference = "the finest mesh" if study.has_contact else "the extrapolation, of order 2, of the two finest meshes"
     yield (
@@ -267,11 +255,11 @@ def _meshes(study: Study) -> Iterator[str]:
         "automatic step."
     )
     yield _meshes_table(study)
-    yield from _bounds(study.points)
+    yield from _explain_bounds(study.points)
 
 
-def _bounds(points: Sequence[ErrorMeasurement]) -> Iterator[str]:
-    """Yield an explanation of errors that are upper bounds, if there are any."""
+def _explain_bounds(points: Sequence[ErrorMeasurement]) -> Iterator[str]:
+    """Yield an explanation of upper bounds, if an error is one."""
     if any(format_error(point).startswith("<") for point in points):
         yield "An error with < is an approximate upper bound, as the reference is not accurate enough."
 

@@ -1,4 +1,4 @@
-"""Results of a study as plain data, and the recommended settings."""
+"""Results of a study, and the settings that it recommends."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from taichi_msm.scene.section import MAX_POINTS
 
 @dataclass(frozen=True)
 class Timing:
-    """Statistics of the times of repeated runs [s], and their number."""
+    """Statistics of the times of repeated runs [s], and number of the runs."""
 
     median: float
     fastest: float
@@ -30,10 +30,10 @@ class Timing:
 
 @dataclass(frozen=True)
 class Reference:
-    """Reference solution for the errors of stepping: central differences in f64, extrapolated."""
+    """Reference for the errors of stepping: central differences in f64, extrapolated without contact."""
 
-    steps_per_frame: int  # of the finest run
-    error: float  # estimated error of the reference, as a fraction of the largest displacement
+    steps_per_frame: int  # in the finest run
+    error: float  # estimated error of the reference, as a fraction of `largest`
     largest: float  # largest displacement of any mass point at any frame [m]
 
 
@@ -45,13 +45,13 @@ class Measurement:
 
     @property
     def seconds(self) -> Timing:
-        """Statistics of the samples, at least one."""
+        """Statistics of the samples; needs at least one."""
         return Timing.of(self.samples)
 
 
 @dataclass
 class SteppingMeasurement(Measurement):
-    """Measurement of stepping through the whole scene with one method and step, without compilation."""
+    """Measurement of stepping through the scene with a method and a step, without compilation."""
 
     precision: str  # f32 or f64
     damping_difference: str  # central or backward
@@ -59,8 +59,8 @@ class SteppingMeasurement(Measurement):
     step: float  # time step h [s]
     # Largest error of any mass point at any frame, as a fraction of the largest displacement; None if it diverged.
     error: float | None = None
-    rounding: float | None = None  # difference from f64 at equal step, as the same fraction; None if unknown
-    known: bool = False  # whether the reference is accurate enough for `error`; otherwise `error` is a rough bound
+    rounding: float | None = None  # difference from f64 with the same step, as such a fraction; None if not measured
+    known: bool = False  # False if `error` is only a rough upper bound, because the reference is too inaccurate
 
     @property
     def method(self) -> str:
@@ -80,12 +80,13 @@ class DrawingMeasurement(Measurement):
 
 @dataclass
 class MeshMeasurement(Measurement):
-    """Measurement of stepping tissue with another mesh through the whole scene, in f64."""
+    """Measurement of stepping through the scene with a mesh, in f64."""
 
     rows: int
     cols: int
     steps_per_frame: int  # of the automatic step on this mesh
-    error: float | None = None  # discretisation error, at the mass points and between them, as in `SteppingMeasurement`
+    # Discretisation error at and between mass points, as a fraction of the largest displacement; None if it diverged.
+    error: float | None = None
     known: bool = False  # as in `SteppingMeasurement`
 
     @property
@@ -96,22 +97,22 @@ class MeshMeasurement(Measurement):
 
 @dataclass
 class Study:
-    """Results of a study: speed against error of a scene on a machine."""
+    """Results of a study: speed against error of a scene's settings on a machine."""
 
     scene: str  # name of the scene
     settings: dict[str, Any]  # the scene with its defaults filled in
     status: str  # complete or interrupted
     tolerance: float  # largest allowed error, as a fraction of the largest displacement
     machine: dict[str, Any]  # CPU, cores, arch, threads, bits of a vector, and versions
-    reference: Reference | None = None  # None if the study was interrupted earlier
-    stepping: list[SteppingMeasurement] = field(default_factory=list)  # by method and then by decreasing step
-    orders: dict[str, float | None] = field(default_factory=dict)  # orders of convergence by method
+    reference: Reference | None = None  # None if the study was interrupted before it
+    stepping: list[SteppingMeasurement] = field(default_factory=list)  # by method, with decreasing steps
+    orders: dict[str, float | None] = field(default_factory=dict)  # order of convergence by method
     drawing: list[DrawingMeasurement] = field(default_factory=list)  # by supersampling and refinement
     points: list[MeshMeasurement] = field(default_factory=list)  # from coarse to fine; empty for springs
-    notes: list[str] = field(default_factory=list)  # remarks for the reader, such as omitted parts and the reason
+    notes: list[str] = field(default_factory=list)  # remarks, such as the reason of an omitted part
 
     def finish(self) -> None:
-        """Remove measurements without timings, sort the steppings, and fit the orders of convergence."""
+        """Remove measurements without samples, sort those of stepping, and fit the orders of convergence."""
         self.stepping = sorted(
             (point for point in self.stepping if point.samples),
             key=lambda point: (point.precision, point.damping_difference != "central", point.steps_per_frame),
@@ -132,16 +133,16 @@ class Study:
 
     @property
     def scene_mesh(self) -> MeshMeasurement | None:
-        """Measurement of the scene's own mesh; None if it was not measured, or diverged."""
+        """Measurement of the scene's own mesh; None if not measured, or diverged."""
         points = list(self.settings["sheet"]["points"])
         return next((mesh for mesh in self.points if [mesh.rows, mesh.cols] == points and mesh.error is not None), None)
 
     @property
     def recommended_points(self) -> tuple[int, int] | None:
-        """Rows and columns of a mesh within the tolerance; None if the scene's mesh is sufficient or was not measured.
+        """Rows and columns of a mesh within the tolerance; None if the scene's mesh is, or was not measured.
 
-        The mesh is the coarsest sufficient one of the measurements; otherwise it is extrapolated with the observed
-        order of convergence, limited to 1 to 2, and may be finer than a scene allows.
+        It is the coarsest measured mesh within the tolerance. Without one, it is extrapolated by the observed order of
+        convergence, limited to 1 to 2, and may be finer than a scene allows.
         """
         scene_mesh, allowed = self.scene_mesh, self.mesh_tolerance
         if scene_mesh is None or scene_mesh.error is None or scene_mesh.error <= allowed:
@@ -161,10 +162,10 @@ class Study:
 
     @property
     def best_stepping(self) -> SteppingMeasurement | None:
-        """Most accurate stepping within the tolerance that takes at most 10 % more time than the fastest.
+        """Most accurate stepping within the tolerance, of those at most 10 % slower than the fastest of them.
 
-        None if there is none, or if the scene needs another mesh, whose steps are not measured. Each method has only
-        its largest step as a candidate: timing noise could favour a smaller one.
+        None if no stepping is within the tolerance, or if the scene needs another mesh, whose steps are not measured.
+        Of each method only the largest step is a candidate, as noise in the times could favour a smaller one.
         """
         if self.recommended_points is not None:
             return None
@@ -176,17 +177,16 @@ class Study:
 
     @property
     def best_drawing(self) -> DrawingMeasurement | None:
-        """Fastest sufficient refinement at the scene's own supersampling; None if not measured."""
+        """Fastest sufficient refinement with the scene's supersampling; None if not measured."""
         return self.best_refinement(self.settings["render"]["supersample"])
 
     def best_refinement(self, supersample: int) -> DrawingMeasurement | None:
-        """Return the fastest sufficient refinement at a supersampling; None if not measured."""
+        """Return the fastest refinement within 0.1 dB of the best with a supersampling; None if not measured."""
         candidates = [
             (math.inf if drawing.psnr is None else drawing.psnr, drawing)
             for drawing in self.drawing
             if drawing.supersample == supersample
         ]
-        # A refinement is sufficient within 0.1 dB of the best.
         min_psnr = max((psnr for psnr, _ in candidates), default=0.0) - 0.1
         sufficient = [drawing for psnr, drawing in candidates if psnr >= min_psnr]
         return min(sufficient, key=lambda drawing: drawing.seconds.median, default=None)
@@ -195,7 +195,7 @@ class Study:
         """Format the recommended settings as lines of a scene file."""
         lines = []
         if (points := self.recommended_points) is not None and max(points) <= MAX_POINTS:
-            # A run searches for the step on this mesh.
+            # With a tolerance, a run finds the step for this mesh.
             lines += [
                 "sheet:",
                 f"  points: {list(points)}",
@@ -219,10 +219,10 @@ class Study:
 
 
 def observed_orders(points: list[SteppingMeasurement]) -> dict[str, float | None]:
-    """Fit the order of convergence of every method to its known errors without significant rounding.
+    """Fit the order of convergence of every method to its errors, except bounds and those with significant rounding.
 
     Returns:
-        Order by the name of the method; None for fewer than three such errors.
+        Order by method; None with fewer than three such errors.
     """
     orders: dict[str, float | None] = {}
     for method in dict.fromkeys(point.method for point in points):

@@ -35,15 +35,15 @@ def run_study(
     Args:
         scene: the scene or its plan.
         name: name of the scene in the report.
-        tolerance: largest allowed error, as a fraction of the largest displacement; None for the scene's, or 1e-3.
-        quick: whether to measure fewer settings, in about a minute for a small sheet.
+        tolerance: largest allowed error, as a fraction of the largest displacement; by default the scene's, else 1e-3.
+        quick: whether to make fewer and shorter measurements.
         arch: cpu, cuda or vulkan.
         threads: number of CPU threads, by default one per core.
-        progress: called with the stage, the finished and the total number of runs or pictures; a KeyboardInterrupt from
+        progress: called with the stage, and the finished and total number of runs or pictures; a KeyboardInterrupt from
             it ends the study with the results so far.
 
     Returns:
-        The measurements, without a report.
+        The measurements.
 
     Raises:
         SceneError: when the scene is quasi-static, the picture cannot be decoded, or the trajectories do not fit in
@@ -71,7 +71,7 @@ def run_study(
     try:
         frames = SteppingStudy(plan, device, longest_run, results, partial(progress, "stepping")).run()
         if texture is None:
-            results.notes.append("drawing was left out: the scene names no image")
+            results.notes.append("drawing was not measured: the scene has no image")
         else:
             deformed = max(frames, key=lambda frame: (frame**2).sum(axis=-1).max())
             position = rest_positions(scene.sheet) + deformed
@@ -79,13 +79,13 @@ def run_study(
         MeshStudy(plan, device, longest_run, results, partial(progress, "points")).run()
     except KeyboardInterrupt:
         results.status = "interrupted"
-        results.notes.append("interrupted: the measurements until then")
+        results.notes.append("interrupted; these are the measurements so far")
     results.finish()
     return results
 
 
 def machine_record(device: Device) -> dict[str, Any]:
-    """Return the machine of a study as JSON data."""
+    """Return a record of this machine and its software for a study, as JSON data."""
     return {
         "cpu": process.processor_name(),
         "cores": os.cpu_count(),
@@ -98,12 +98,12 @@ def machine_record(device: Device) -> dict[str, Any]:
 
 def _require_memory(scene: Scene) -> None:
     rows, cols = scene.sheet.points
-    # At most six trajectories: the reference, its extrapolation, and the compared runs.
+    # There are at most six trajectories at a time: reference, its extrapolation, compared runs.
     needed = 6 * scene.time.frames * rows * cols * 3 * 8
     available = process.available_memory()
     if needed > available:
         fault = (
             f"time.duration: a study keeps the trajectories of all frames, {needed / 2**30:.3g} GiB here, but "
-            f"{available / 2**30:.3g} GiB is free; study a shorter time.duration or fewer sheet.points"
+            f"{available / 2**30:.3g} GiB is free; reduce time.duration or sheet.points"
         )
         raise SceneError([fault])

@@ -1,7 +1,7 @@
 """A dask.distributed cluster as a `concurrent.futures` executor.
 
-A worker plugin sends the scene and its files to every worker once, including workers that join later. A worker needs
-this package and access to the directory of the sweep.
+A worker plugin sends the scene and its files once to every worker, also to those that join later. A worker needs this
+package, and access to the directory of the sweep.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ MAX_WAIT_S = 10
 
 
 class Inputs(WorkerPlugin):  # type: ignore[misc]  # that package has no types
-    """Worker plugin with the common inputs of all runs of a sweep.
+    """Worker plugin with the inputs that all runs of a sweep have in common.
 
     Args:
         sweep: sweep with the scene and the files of the runs.
@@ -44,13 +44,13 @@ class Inputs(WorkerPlugin):  # type: ignore[misc]  # that package has no types
 
     Attributes:
         versions: required versions of this package and its libraries, by name.
-        error: reason why the worker cannot execute runs; empty if it can.
-        copies: local copies of the files, by original path.
+        error: why the worker cannot execute runs; empty if it can.
+        copies: paths of local copies of the files, by path of the file.
     """
 
     def __init__(self, sweep: Sweep, directory: Path) -> None:
         scene = sweep.scene
-        # Absolute paths do not depend on a worker's current directory.
+        # Absolute, as workers have other current directories.
         self.scene, self.directory = scene._replace(folder=scene.folder.absolute()), directory.absolute()
         self.home = Path.cwd()
         self.versions = result_versions(versions(), "cpu")
@@ -85,12 +85,12 @@ class Inputs(WorkerPlugin):  # type: ignore[misc]  # that package has no types
             shutil.rmtree(self._folder, ignore_errors=True)
 
     def pause(self, _stage: str, _done: int, _total: int) -> None:
-        """Interrupt a run after `teardown`; a progress callback."""
+        """Interrupt the run after `teardown`; a progress callback."""
         if self._ended:
             raise KeyboardInterrupt
 
     def _check(self, worker: Any) -> str:
-        """Return the reason why a worker cannot execute runs, or an empty string."""
+        """Return the reason why a worker cannot execute runs; empty if it can."""
         if (threads := worker.state.nthreads) != 1:
             return f"worker {worker.address} has {threads} threads; start it with one: dask worker --nthreads 1"
         # Results in a worker's own directory would be lost.
@@ -105,11 +105,11 @@ class Inputs(WorkerPlugin):  # type: ignore[misc]  # that package has no types
 
 
 class Cluster(ClientExecutor):  # type: ignore[misc]
-    """Executor for the workers of a scheduler; sends only the number, overrides and directory of each run.
+    """Executor on the workers of a scheduler; sends only number, overrides and directory of a run.
 
     Args:
         client: connection to the scheduler.
-        name: name of the plugin `Inputs`.
+        name: name of the plugin `Inputs` on the scheduler.
     """
 
     def __init__(self, client: Any, name: str) -> None:
@@ -120,11 +120,11 @@ class Cluster(ClientExecutor):  # type: ignore[misc]
         """Schedule a call in an idle worker.
 
         Args:
-            function: an importable function; `execute_run` takes the scene and its files from the plugin `Inputs`.
+            function: an importable function; `execute_run` gets the scene and its files from the plugin.
             arguments: picklable arguments of the function.
 
         Returns:
-            The future result.
+            Future of the result.
 
         Raises:
             BrokenExecutor: when the connection to the scheduler is lost.
@@ -152,12 +152,12 @@ def _execute_run(name: str, run: int, overrides: tuple[str, ...], directory: Pat
         outcome: Outcome = _call(name, execute_run, task, inputs.pause)
         inputs.pause("", 0, 0)
         return outcome
-    # The worker is closing: dask executes the run in another one.
+    # The worker closes; dask executes the run in another one.
     raise Reschedule
 
 
 def _inputs(name: str) -> Inputs:
-    """Return the inputs of this worker."""
+    """Return the plugin of this worker."""
     inputs: Inputs | None = get_worker().plugins.get(name)
     if inputs is None:
         raise ExecutorError("another command for the same folder has ended meanwhile")
@@ -170,7 +170,7 @@ def _inputs(name: str) -> Inputs:
 def cluster_connection(
     address: str, sweep: Sweep, directory: Path, progress: StageProgressCallback
 ) -> Iterator[Cluster]:
-    """Connect to a scheduler and send the inputs of a sweep to its workers; a context manager.
+    """Connect to a scheduler, and send the inputs of a sweep to its workers; a context manager.
 
     Args:
         address: address of the scheduler, such as tcp://10.0.0.1:8786.
@@ -179,15 +179,15 @@ def cluster_connection(
         progress: called while waiting for the first worker.
 
     Yields:
-        An executor for the workers.
+        An executor on the workers.
 
     Raises:
         ExecutorError: when no scheduler answers, or a worker cannot execute runs.
-        LostExecutorError: when the connection is lost within the block; replaces the error of the block.
+        LostExecutorError: in place of an error of the block, when the connection is lost.
     """
     with silence_logging_cmgr(logging.CRITICAL):
         client = _client(address)
-        # One name per directory: a new command replaces the plugin of a killed one.
+        # A name per directory: a new command replaces the plugin of a killed one.
         name = f"taichi-msm {directory.absolute()}"
         cluster, lost = Cluster(client, name), False
         try:
@@ -195,7 +195,7 @@ def cluster_connection(
             _wait_for_worker(client, progress)
             yield cluster
         except ExecutorError as error:
-            # Only a lost connection cancels runs within the block.
+            # Within the block, only a lost connection cancels runs.
             if lost := isinstance(error.__cause__, (BrokenExecutor, CancelledError, OSError)):
                 raise LostExecutorError(f"lost the scheduler at {address}") from error
             raise
@@ -211,7 +211,7 @@ def cluster_connection(
 def _client(address: str) -> Any:
     remedy = "give the address that `dask scheduler` prints, such as tcp://10.0.0.1:8786"
     try:
-        # A client would wait forever for the handshake of another service, such as the scheduler's web page.
+        # With another service, such as the scheduler's web page, a client would wait for the handshake forever.
         LoopRunner(asynchronous=False).run_sync(_check_scheduler, address)
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # `Inputs` compares versions.
@@ -232,13 +232,13 @@ async def _check_scheduler(address: str) -> None:
 
 
 def _register_inputs(inputs: Inputs, name: str, client: Any) -> None:
-    """Send the inputs to all workers, including later ones."""
+    """Send the inputs to all workers, also to later ones."""
     try:
         client.register_plugin(inputs, name=name)
     except ExecutorError:
         raise
     except Exception as error:
-        # Unpickling raises an arbitrary error if a worker lacks a package.
+        # Where a worker lacks a package, unpickling raises any error.
         raise ExecutorError(f"a worker cannot execute runs: {error}; install the same packages there") from None
 
 

@@ -1,7 +1,7 @@
 """Expressions of variables in a sweep's `set`: texts that begin with =, such as "=0.5 + x / 2".
 
-`ast` parses them, and `_value` evaluates the kinds of nodes that it lists; all others are errors. Powers are computed
-as floats, so that 9**9**9 overflows at once.
+`ast` parses an expression, and `_value` evaluates a few kinds of nodes and rejects all others. Powers are computed as
+floats, so that 9**9**9 overflows at once.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from typing import Any
 
 from taichi_msm.errors import Key, did_you_mean, truncate
 
-# Longer texts could nest deeper than Python's stack.
+# Largest number of characters; longer texts could nest deeper than Python's stack.
 MAX_LENGTH = 200
 
 FUNCTIONS: dict[str, Callable[..., float]] = {
@@ -53,8 +53,8 @@ def evaluate(text: str, variables: Mapping[str, float]) -> float:
     """Evaluate an expression.
 
     Args:
-        text: the expression, with = at its beginning.
-        variables: values by name; with NaN, only errors that do not depend on values are raised.
+        text: expression that begins with =.
+        variables: values by name; NaN raises only the errors that do not depend on values.
 
     Returns:
         The value; an int if the expression has only ints and no division.
@@ -74,7 +74,7 @@ def evaluate(text: str, variables: Mapping[str, float]) -> float:
 
 
 def _value(node: ast.expr, names: Mapping[str, float]) -> float:
-    """Return the value of a node; recursive."""
+    """Return the value of a node, recursively."""
     values: list[float]
     function: Callable[..., float]
     match node:
@@ -105,11 +105,11 @@ def _value(node: ast.expr, names: Mapping[str, float]) -> float:
 
 
 def replace_expressions(value: Any, change: Callable[[Key, str], Any], path: Key = ()) -> Any:
-    """Return a value of `set` with its expressions replaced.
+    """Return a copy of a value of `set` with its expressions replaced.
 
     Args:
         value: plain data.
-        change: function of the key and the text of an expression; returns the replacement.
+        change: function from the key and the text of an expression to its replacement.
         path: key of the value.
     """
     if isinstance(value, str):

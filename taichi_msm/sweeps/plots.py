@@ -1,13 +1,13 @@
 """Plots of a sweep: results against parameters, a contact sheet of frames, and first-order sensitivities.
 
-The first-order sensitivity index is the share of a result's variance explained by one parameter alone.
+The first-order sensitivity index is the share of a result's variance that one parameter alone explains.
 
 Source: Plischke, "An effective algorithm for computing global sensitivity indices (EASI)", 2010, and Tissot and Prieur,
 "Bias correction for the estimation of sensitivity indices based on random balance designs", 2012; both as RBD-FAST of
-SALib. The method sorts the results by one parameter and assumes random order of the others. Sobol points and grids have
-none: neighbours in one coordinate alternate between low and high values of another. Therefore neighbours are shuffled,
-and the index is the mean over several shuffles. For y of 3 x + y at 64 Sobol points, the root-mean-square error of the
-index is 0.3 without shuffles and 0.07 with them.
+SALib. The method sorts the results by one parameter, and assumes that the others then have random order. At Sobol
+points and on grids they alternate between low and high values. So neighbours in the order are shuffled, and the index
+is the mean over several shuffles: for the parameter y of the result 3 x + y at 64 Sobol points, its root-mean-square
+error is 0.07, and 0.3 without shuffles.
 
 Matplotlib and SALib are optional; functions import them.
 """
@@ -55,7 +55,7 @@ class PlotData(NamedTuple):
 
 
 def plot(data: PlotData, file: BinaryIO) -> None:
-    """Plot sweep.png: a panel for each pair of a result and one of the most sensitive parameters.
+    """Plot sweep.png: a panel for each result and each of the most sensitive parameters.
 
     Args:
         data: parameters and results of the plotted runs.
@@ -101,7 +101,7 @@ def _figure(data: PlotData) -> Figure:
 
 
 def _most_sensitive(data: PlotData) -> list[VariedParameter]:
-    """Return the eight most sensitive parameters, in their original order."""
+    """Return the eight parameters with the largest indices, in their original order."""
     largest = dict.fromkeys((parameter.name for parameter in data.parameters), -math.inf)
     for index in data.indices:
         largest[index.parameter] = max(index.first_order, largest[index.parameter])
@@ -124,7 +124,7 @@ def _plot_runs(axes: Axes, parameter: VariedParameter, numbers: NDArray[np.float
     """Plot a dot for each run, and a cross at the bottom edge for each failed run."""
     x = parameter.numbers
     if parameter.labels:
-        # Random offsets separate the dots of a label.
+        # Random offsets separate the dots at a label.
         x = x + 0.3 * (np.random.default_rng(0).random(len(x)) - 0.5)
     area_pt2 = float(np.clip(900 / len(x), 1.5, 12))
     axes.scatter(x, numbers, area_pt2, color=BLUE, alpha=0.6, linewidths=0)
@@ -133,7 +133,7 @@ def _plot_runs(axes: Axes, parameter: VariedParameter, numbers: NDArray[np.float
 
 
 def _plot_index(axes: Axes, index: SensitivityIndex) -> None:
-    """Plot the index as a bar above a panel; the width of the panel is 1."""
+    """Plot an index as a bar above a panel, as wide as the panel for an index of 1."""
     low, middle, high = np.clip(index.first_order + index.confidence * np.array([-1, 0, 1]), 0, 1)
     line_style: dict[str, Any] = {"transform": axes.transAxes, "clip_on": False, "solid_capstyle": "butt"}
     for left, right, colour, width in ((0, 1, PALE, 5), (0, middle, ORANGE, 5), (low, high, INK, 0.8)):
@@ -161,13 +161,13 @@ def _format_axis(axes: Axes, parameter: VariedParameter) -> None:
     else:
         axes.xaxis.set_major_locator(MaxNLocator(3))
     axes.xaxis.set_major_formatter(_tick_label)
-    # The limits include failed runs.
+    # The limits of the axis include failed runs.
     axes.update_datalim([(number, 1) for number in parameter.numbers], updatey=False)
     axes.autoscale(axis="x")
 
 
 def _tick_label(number: float, _: float) -> str:
-    """Format a number with its own exponent: a common one above the axis would overlap the sensitivity bar."""
+    """Format a number with its own exponent, as a common one above the axis would overlap the bar of the index."""
     if number == 0 or 1e-3 <= abs(number) < 1e5:
         return f"{number:.10g}"
     digits, exponent = f"{number:.10e}".split("e")
@@ -183,20 +183,20 @@ class Tile(NamedTuple):
     """Run in the contact sheet."""
 
     frame: Image.Image | None  # frame with the largest displacement
-    status: str  # in place of a missing frame
-    caption: list[str]  # unbreakable parts
+    status: str  # text in place of a missing frame
+    caption: list[str]  # parts that line breaks may separate
 
 
 def write_contact_sheet(
     state: SweepState, written: list[str], executor: Executor, progress: StageProgressCallback
 ) -> list[str]:
-    """Write contact.jpg, if any run has a frame.
+    """Write contact.jpg if a run has a picture.
 
     Args:
         state: the finished sweep.
         written: names of the written reports; contact.jpg is appended.
         executor: draws the frames of runs without pictures.
-        progress: called with the stage, the drawn and the total number of frames.
+        progress: called with the stage, and the drawn and total number of frames.
 
     Returns:
         Warnings.
@@ -228,7 +228,7 @@ def write_contact_sheet(
 
 
 def draw_largest_frame(directory: Path) -> NDArray[np.uint8]:
-    """Draw the frame of the largest displacement of a run on one thread; shape (height, width, 3)."""
+    """Draw the frame with the largest displacement of a run on one thread, shape (height, width, 3)."""
     from taichi_msm.runs.playback import Playback
 
     with Playback(directory, threads=1) as run:
@@ -238,7 +238,7 @@ def draw_largest_frame(directory: Path) -> NDArray[np.uint8]:
 def _largest_frames(
     directories: dict[int, Path], executor: Executor, progress: StageProgressCallback
 ) -> tuple[dict[int, Image.Image], list[str]]:
-    """Read or draw the frame of the largest displacement of each run; return the frames by run, and the errors."""
+    """Read or draw the frame with the largest displacement of each run; return the frames by run, and the errors."""
     frames: dict[int, Image.Image] = {}
     futures: dict[int, Future[NDArray[np.uint8]]] = {}
     errors = []
@@ -248,7 +248,7 @@ def _largest_frames(
             if finished.has_output("png"):
                 frames[run] = Image.fromarray(finished.read_picture("png", finished.largest_frame))
             elif finished.has_output("gif"):
-                # The middle of the frame: a GIF rounds its beginning.
+                # The middle of the frame, as a GIF rounds the beginning.
                 time = (finished.largest_frame + 0.5) / finished.scene.time.frames_per_second
                 frames[run] = read_gif_frame(finished.result_path("gif"), time)
             elif finished.has_output("trajectory") and finished.scene.image is not None:
@@ -275,7 +275,7 @@ def read_gif_frame(path: Path, time: float) -> Image.Image:
         time: time from its start [s].
 
     Returns:
-        The RGB picture at the time, or the last one after the end.
+        The RGB picture at the time; after the end, the last one.
 
     Raises:
         FilesError: when the GIF cannot be read or decoded.
@@ -290,7 +290,7 @@ def read_gif_frame(path: Path, time: float) -> Image.Image:
 
 
 def _column_count(state: SweepState, tiles: int) -> int:
-    """Choose the number of columns: the number of values of a grid's last key, or about the number of rows."""
+    """Choose the number of columns: of a grid, the number of values of its last key; otherwise about that of rows."""
     last = list(state.sweep.settings.distributions.values())[-1]
     if tiles == len(state.outcomes) and last.kind == "grid" and 1 < len(last.values) <= 8:
         return len(last.values)
@@ -327,14 +327,14 @@ def _draw_tiles(tiles: Sequence[Tile], columns: int, heading: str) -> Image.Imag
 
 
 def _wrap(parts: Iterable[str], fits: Callable[[str], bool]) -> list[str]:
-    """Wrap parts into lines; long parts and excess lines are truncated."""
+    """Join parts to lines that fit; truncate parts that are too long, and lines after `MAX_CAPTION_LINES`."""
     lines = [""]
     for part in parts:
         longer = f"{lines[-1]}   {part}".lstrip()
         if fits(longer):
             lines[-1] = longer
             continue
-        # 300 characters are longer than any line; the limit bounds the loop.
+        # No line has space for 300 characters; the limit bounds the loop.
         cut = part[:300]
         while not fits(cut):
             cut = f"{cut[:-2]}…"
@@ -343,7 +343,7 @@ def _wrap(parts: Iterable[str], fits: Callable[[str], bool]) -> list[str]:
 
 
 def abbreviate_keys(keys: Sequence[str]) -> list[str]:
-    """Abbreviate dotted keys to their shortest unambiguous suffix that starts with a word."""
+    """Abbreviate dotted keys to their shortest unambiguous ends that begin with a word."""
     names = []
     for key in keys:
         parts = key.split(".")
@@ -359,7 +359,7 @@ def abbreviate_keys(keys: Sequence[str]) -> list[str]:
 
 
 def format_short(value: Any) -> str:
-    """Format a value for a caption: numbers with three significant digits, paths without their folder."""
+    """Format a value for a caption: numbers with three significant digits, paths without folders."""
     if isinstance(value, float):
         return f"{float(f'{value:.3g}'):g}"
     if isinstance(value, str):
@@ -377,7 +377,7 @@ class VariedParameter(NamedTuple):
     name: str  # abbreviated key, with the index of a list's component
     numbers: NDArray[np.float64]  # values, or indices of non-numeric values; shape (runs,)
     is_logarithmic: bool = False
-    labels: Sequence[str] = ()  # of at most eight non-numeric values
+    labels: Sequence[str] = ()  # of non-numeric values, if at most eight
 
 
 def varied_parameters(state: SweepState, runs: Sequence[int]) -> list[VariedParameter]:
@@ -420,7 +420,7 @@ def varied_results(state: SweepState, runs: Sequence[int]) -> dict[str, NDArray[
 
 
 def is_wide_range(numbers: NDArray[np.float64]) -> bool:
-    """Return whether an axis is logarithmic: all numbers but NaN are positive, with a ratio above 50."""
+    """Return whether numbers, except NaN, need a logarithmic axis: all positive, largest over smallest above 50."""
     return bool(np.nanmin(numbers) > 0 and np.nanmax(numbers) > 50 * np.nanmin(numbers))
 
 
@@ -450,31 +450,33 @@ class SensitivityIndex(NamedTuple):
 
     result: str
     parameter: str
-    first_order: float  # about 0 to 1
+    first_order: float  # 0 to 1, up to estimation errors
     confidence: float  # half-width of the 95 % interval
 
 
 def estimate_sensitivity(
     parameters: Sequence[VariedParameter], results: Mapping[str, NDArray[np.float64]]
 ) -> list[SensitivityIndex]:
-    """Estimate the first-order sensitivities of results.
+    """Estimate the first-order sensitivity of every result to every parameter.
 
     Args:
-        parameters: parameters that vary, with values of shape (runs,).
-        results: by name, shape (runs,); NaN where a run lacks the result.
+        parameters: varied parameters.
+        results: results by name, shape (runs,); NaN where a run lacks the result.
 
     Returns:
-        Indices of all parameters, for each result of at least 64 runs.
+        An index of each parameter for each result that at least 64 runs have.
 
     Raises:
         ImportError: when SALib is not installed.
     """
     indices = []
     for name, column in results.items():
-        known = np.isfinite(column)
-        if np.count_nonzero(known) >= 64:  # With fewer, indices are too inaccurate to rank parameters.
+        is_finite = np.isfinite(column)
+        if np.count_nonzero(is_finite) >= 64:  # Fewer are too inaccurate to rank parameters.
             indices += [
-                SensitivityIndex(name, parameter.name, *first_order_index(parameter.numbers[known], column[known]))
+                SensitivityIndex(
+                    name, parameter.name, *first_order_index(parameter.numbers[is_finite], column[is_finite])
+                )
                 for parameter in parameters
             ]
     return indices
@@ -498,7 +500,7 @@ def first_order_index(parameter: NDArray[np.float64], result: NDArray[np.float64
     for shuffle in range(8):
         shuffled = random.permutation(len(result))
         ranks = np.argsort(np.argsort(parameter[shuffled], kind="stable"), kind="stable")
-        # Ranks in groups of four keep their random order.
+        # Groups of four successive ranks keep their random order.
         ordered = result[shuffled][np.argsort(ranks // 4, kind="stable")]
         positions = np.arange(len(result), dtype=np.float64)[:, np.newaxis]
         analysis = rbd_fast.analyze(problem, positions, ordered, M=4, num_resamples=25, seed=1 + shuffle)

@@ -1,7 +1,7 @@
 """A process pool as a `concurrent.futures` executor that survives the death of a process.
 
-A killed process fails only its own call, with a `DiedError`; the next call starts a new process. Unlike the standard
-library's pool, processes do not import the caller's main module.
+A killed process fails only its own call, with a `DiedError`; the next call starts a new one. Unlike those of the
+standard library's pool, the processes do not import the caller's main module.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ PARENT_POLL_S = 0.2
 
 
 class DiedError(MsmError):
-    """The process of a call ended before the call returned."""
+    """The process of a call ended before the call."""
 
 
 class Pool(Executor):
@@ -50,16 +50,16 @@ class Pool(Executor):
             named: picklable named arguments of the function.
 
         Returns:
-            The future result, which must be picklable; a `DiedError` if the process ends early.
+            Future of the result, which must be picklable; it raises a `DiedError` if the process ends before.
         """
         return self._threads.submit(self._call, function, arguments, named)
 
     def shutdown(self, wait: bool = True, *, cancel_futures: bool = False) -> None:
-        """End the processes after their calls.
+        """End every process after its call.
 
         Args:
             wait: whether to wait for running calls.
-            cancel_futures: whether to cancel pending calls and kill the processes at once.
+            cancel_futures: whether to cancel pending calls, and kill the processes at once.
         """
         self._threads.shutdown(wait=False, cancel_futures=cancel_futures)
         if cancel_futures:
@@ -106,7 +106,7 @@ def _start_process() -> subprocess.Popen[bytes]:
 
 
 def _close(process: subprocess.Popen[bytes]) -> int:
-    """End a process after its call; return its exit code."""
+    """End a process that has no call; return its exit code."""
     assert process.stdin
     assert process.stdout
     with suppress(BrokenPipeError):
@@ -124,11 +124,11 @@ def _exit_reason(code: int) -> str:
 
 
 def serve() -> None:
-    """Execute calls from stdin in a process of the pool, until the parent closes the pipe or dies."""
+    """Execute the calls from stdin until the parent closes the pipe or dies; the main function of a process."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     Thread(target=_exit_with_parent, args=[os.getppid()], daemon=True).start()
     answers = os.fdopen(os.dup(1), "wb")
-    # Output of libraries must not mix with the answers.
+    # What libraries print on stdout must not mix with the answers.
     os.dup2(2, 1)
     while True:
         try:
@@ -147,7 +147,7 @@ def serve() -> None:
 
 
 def _exit_with_parent(parent: int) -> None:
-    """Exit after the death of the parent process, to unlock the directory of the run."""
+    """Exit after the death of the parent, which unlocks the directory of the run."""
     while os.getppid() == parent:
         time.sleep(PARENT_POLL_S)
     os._exit(1)

@@ -1,4 +1,4 @@
-"""Runs of a sweep: the sweep's directory, execution of missing runs, and outcomes."""
+"""Runs of a sweep: directory of the sweep, execution of missing runs, outcomes."""
 
 from __future__ import annotations
 
@@ -39,12 +39,12 @@ from taichi_msm.system.files import read_regular
 # Reports written at the end of a sweep.
 REPORT_FILES = ("table.csv", "table.parquet", "dataset.json", "contact.jpg", "sensitivity.csv", "sweep.png")
 
-# Statuses of runs that are not repeated.
+# Status of runs that are not repeated.
 FINAL_STATUSES = ("complete", "diverged")
 
 
 def _register(sweep: Sweep, directory: Path) -> list[list[Any]]:
-    """Write the record of a sweep to its directory, or compare an existing record; return the values of the runs."""
+    """Write the record of a sweep, or compare the sweep with an existing one; return the values of the runs."""
     record = require_kind(directory / SWEEP_RECORD, FILE)
     require_kind(directory / RUNS_FOLDER, FOLDER)
     description, values = sweep.description(), sweep.values()
@@ -97,16 +97,16 @@ class SweepState:
 
     directory: Path
     sweep: Sweep
-    values: list[list[Any]]  # values of the varied keys, for each run of the sweep
-    outcomes: list[Outcome]  # outcomes of the finished runs; grows while the sweep runs
-    missing: list[RunTask] = field(default_factory=list)  # runs that were unfinished when the sweep began or resumed
+    values: list[list[Any]]  # values of the variables and varied keys, for every run of the sweep
+    outcomes: list[Outcome]  # of finished runs; grows while the sweep runs
+    missing: list[RunTask] = field(default_factory=list)  # runs that were not finished when this command began
 
     def columns(self) -> dict[str, list[Any]]:
         """Return the result columns of the table by name."""
         columns = {name: [getattr(outcome, name) for outcome in self.outcomes] for name in RESULT_COLUMNS}
         for n in range(max((len(outcome.forces) for outcome in self.outcomes), default=0)):
             name = f"probes.{n}.force"
-            # The sweep may vary a key of this name.
+            # The sweep may vary this key, which has its own column.
             name += ".greatest" if name in self.sweep.keys else ""
             columns[name] = [outcome.forces[n] if n < len(outcome.forces) else None for outcome in self.outcomes]
         return columns | {"seconds": [outcome.seconds for outcome in self.outcomes]}
@@ -121,15 +121,15 @@ def begin_sweep(sweep: Sweep, directory: Path, shard: tuple[int, int] = (1, 1)) 
 
     Args:
         sweep: the sweep.
-        directory: of the sweep; created if it does not exist.
-        shard: part I of N as (I, N), 1 <= I <= N.
+        directory: directory of the sweep, created if missing.
+        shard: shard I of N as (I, N), 1 <= I <= N.
 
     Returns:
-        The finished and the missing runs of the shard.
+        The sweep, with the finished and the missing runs of the shard.
 
     Raises:
-        SceneError: when the directory contains another sweep, or the runs of versions with other results.
-        FilesError: when the directory cannot be read or written, contains foreign files, or is damaged.
+        SceneError: when the directory contains another sweep, or runs of other versions, whose results may differ.
+        FilesError: when the directory cannot be read or written, has foreign files, or a damaged record.
     """
     state = SweepState(directory, sweep, _register(sweep, directory), [])
     part, parts = shard
@@ -148,11 +148,11 @@ def read_outcome(task: RunTask, sweep: Sweep) -> Outcome | None:
     """Read the outcome of a finished run.
 
     Args:
-        task: the run, with the overrides that the record must have.
-        sweep: the sweep, with all files that the record may have.
+        task: run, with the overrides that its record must have.
+        sweep: sweep, with the files that the record may have.
 
     Returns:
-        The outcome; None if the record is missing, damaged, or of an interrupted run or another task.
+        The outcome; None if the record is missing, damaged, of an interrupted run or of another task.
     """
     # A run with a damaged record is repeated.
     with suppress(OSError, ValueError, KeyError, TypeError, AttributeError, RecursionError):
@@ -169,11 +169,11 @@ def lock_reports(directory: Path, pause: errors.Pause) -> BinaryIO:
     """Lock the reports of a sweep.
 
     Args:
-        directory: of the sweep.
+        directory: directory of the sweep.
         pause: called repeatedly while another command holds the lock; an exception from it ends the wait.
 
     Returns:
-        The locked file; closing it releases the lock.
+        The locked file, which releases the lock when closed.
     """
     while True:
         try:
@@ -190,7 +190,7 @@ POLL_INTERVAL_S = 0.1
 def run_missing(state: SweepState, executor: Executor, progress: StageProgressCallback) -> Iterator[Outcome]:
     """Execute the missing runs of a sweep, and yield their outcomes in order of completion.
 
-    A run whose process in `Pool` ended early is executed once more.
+    A run whose process of the `Pool` died is executed once more.
 
     Args:
         state: the sweep; receives the outcomes.
@@ -220,7 +220,7 @@ def run_missing(state: SweepState, executor: Executor, progress: StageProgressCa
         future.add_done_callback(done.put)
 
     remaining = iter(state.missing)
-    # The number of submitted runs is limited, to bound the memory of the executor.
+    # At most 4096 runs are submitted at a time, which bounds the memory of the executor.
     for task in islice(remaining, 4096):
         submit(task)
     while pending:
@@ -243,7 +243,7 @@ def run_missing(state: SweepState, executor: Executor, progress: StageProgressCa
                 continue
             outcome = Outcome(task.run, "died", f"{error}, twice")
         except Exception as error:
-            # `execute_run` raises nothing: the worker has died. Other executors have their own retries.
+            # As `execute_run` raises nothing, the worker died. Executors other than the pool have retried the run.
             failures = getattr(error, "allowed_failures", None)  # of dask's KilledWorker, whose text has an address
             reason = str(error) if failures is None else f"its workers died, {failures + 1} one after another"
             outcome = Outcome(task.run, "died", " ".join(reason.split()))
@@ -260,7 +260,7 @@ class RunTask(NamedTuple):
     scene: ParsedFile
     overrides: tuple[str, ...]
     directory: Path  # of the results
-    home: Path  # base of relative paths
+    home: Path  # current directory of the run, the base of relative paths
 
 
 def execute_run(task: RunTask, progress: StageProgressCallback = lambda stage, done, total: None) -> Outcome:
@@ -271,7 +271,7 @@ def execute_run(task: RunTask, progress: StageProgressCallback = lambda stage, d
         progress: called several times a second; may raise KeyboardInterrupt, as in `runs.run.run`.
 
     Returns:
-        The outcome, also of a failed run; only exceptions from `progress` are raised.
+        The outcome, also of a failed run; nothing is raised but exceptions from `progress`.
     """
     os.chdir(task.home)
     status: Status
@@ -284,7 +284,7 @@ def execute_run(task: RunTask, progress: StageProgressCallback = lambda stage, d
     except Exception as error:
         bug = f"a bug, please report it: {type(error).__name__}: {error}"
         status, reason = "failed", errors.out_of_memory(error) or bug
-    # Removes absolute paths from the reason; the path of a picture follows a space.
+    # Absolute paths are removed from the reason: of the run, and of a picture, which follows a space.
     reason = " ".join(reason.split()).replace(str(task.directory), task.directory.name)
     return Outcome(task.run, status, reason.replace(f" {task.scene.folder / '_'}"[:-1], " "))
 
@@ -303,14 +303,14 @@ def _run_scene(task: RunTask, progress: StageProgressCallback) -> Mapping[str, A
     )
 
 
-# "refused": invalid values; "failed": an error; "died": the process ended early twice.
+# "refused": invalid values; "failed": another error; "died": its process died twice.
 Status = Literal["complete", "diverged", "refused", "failed", "died"]
 STATUSES: tuple[Status, ...] = get_args(Status)
 
 
 @dataclass(frozen=True)
 class Outcome:
-    """Status and results of a run of a sweep; results are None where missing."""
+    """Status and results of a run of a sweep; a missing result is None."""
 
     __pydantic_config__: ClassVar[ConfigDict] = ConfigDict(allow_inf_nan=False)
 
@@ -330,7 +330,7 @@ _OUTCOME = TypeAdapter(Outcome)
 
 
 def _outcome_from_record(run: int, record: Mapping[str, Any]) -> Outcome:
-    """Extract the outcome of a run from its run.json; other content raises an arbitrary exception."""
+    """Extract the outcome of a run from its run.json; foreign content may raise any exception."""
     estimate = record["error_estimate"] or {}
     return _OUTCOME.validate_python(
         {
@@ -342,7 +342,7 @@ def _outcome_from_record(run: int, record: Mapping[str, Any]) -> Outcome:
             "error_estimate": estimate.get("error"),
             "mesh_error": estimate.get("mesh_error"),
             "forces": tuple(probe.get("greatest_force") for probe in record["probes"]),
-            "notes": tuple(record["notes"][1:]),  # The first is about the errors.
+            "notes": tuple(record["notes"][1:]),  # The first is the error estimate.
             "seconds": record["timings"]["total"],
         }
     )

@@ -1,4 +1,4 @@
-"""Sweep files: parsing, distributions of the varied keys, and values of the runs."""
+"""Sweep files: checks, distributions of keys and variables, and values of the runs."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ from taichi_msm.scene.section import (
 )
 from taichi_msm.sweeps.expressions import CONSTANTS, FUNCTIONS, ExpressionError, evaluate, replace_expressions
 
-# Columns of table.csv between those of the varied keys and of the probes' forces.
+# Columns of table.csv between the varied keys and the forces of probes.
 RESULT_COLUMNS = ("status", "error", "max_displacement", "shortest_spring", "error_estimate", "mesh_error")
 
 MAX_RUNS = 10**7
@@ -46,14 +46,13 @@ MAX_RUNS = 10**7
 # Limit of SciPy's Sobol sequences.
 MAX_DIMENSIONS = 21201
 
-
 RANGE = "[low, high]: numbers, or lists of one shape"
 LIST = "a list of values that is not empty"
 NonEmptyList = Annotated[list[Any], Field(min_length=1)]
 
 
 class Distribution(Section):
-    """Distribution of a varied key, with exactly one field set; lists of numbers vary componentwise."""
+    """Distribution of a varied key, by exactly one field; lists of numbers vary componentwise."""
 
     model_config = ConfigDict(validate_default=False)
 
@@ -67,7 +66,7 @@ class Distribution(Section):
 
     @model_validator(mode="before")
     @classmethod
-    def _is_flat(cls, data: Any) -> Any:
+    def _is_mapping(cls, data: Any) -> Any:
         if not isinstance(data, dict):
             remedy = "take one such as {uniform: [1, 2]} or {choice: [1, 2]}"
             raise scene_fault(f"{format_value(data)} is not a distribution; {remedy}")
@@ -115,7 +114,7 @@ class Distribution(Section):
         return value
 
     @model_validator(mode="after")
-    def _is_one(self) -> Self:
+    def _has_one_field(self) -> Self:
         if len(self.model_fields_set) != 1:
             raise scene_fault(f"expected one of {', '.join(type(self).model_fields)}")
         return self
@@ -127,18 +126,18 @@ class Distribution(Section):
 
     @property
     def values(self) -> Any:
-        """Parameters of the distribution, or values of a choice or grid."""
+        """Value of the field: two parameters, or the values of a choice or grid."""
         return getattr(self, self.kind)
 
     @property
     def dimensions(self) -> int:
-        """Number of fractions that `value` takes: 1 per number, 1 for a choice, 0 for a grid."""
+        """Number of fractions for `value`: one per number, one for a choice, none for a grid."""
         if self.kind in ("choice", "grid"):
             return int(self.kind == "choice")
         return len(_numbers(self.values[0]))
 
     def value(self, fractions: Sequence[float]) -> Any:
-        """Apply the quantile function to fractions in [0, 1), shape (dimensions,)."""
+        """Return the value of fractions in [0, 1), by the quantile function; shape (dimensions,)."""
         if self.kind == "choice":
             return self.values[int(fractions[0] * len(self.values))]
         remaining = iter(fractions)
@@ -146,7 +145,7 @@ class Distribution(Section):
 
 
 def _quantile(kind: str, first: float, second: float, fraction: float) -> float:
-    """Apply the quantile function of a distribution with two parameters."""
+    """Return the quantile at a fraction of a distribution with two parameters."""
     if kind == "normal":
         from scipy.special import ndtri
 
@@ -160,14 +159,14 @@ def _quantile(kind: str, first: float, second: float, fraction: float) -> float:
 
 
 def _map_pairs(function: Callable[[float, float], float], first: Any, second: Any) -> Any:
-    """Apply a function to the pairs of numbers in two values of one shape."""
+    """Apply a function to the pairs of corresponding numbers in two values of one shape."""
     if isinstance(first, list):
         return list(map(partial(_map_pairs, function), first, second))
     return float(function(first, second))
 
 
 def _numbers(value: Any) -> list[float]:
-    """Return the flattened numbers of a value; empty if it contains anything else."""
+    """Return all numbers in nested lists; empty if they contain anything else."""
     if isinstance(value, list):
         parts = [_numbers(item) for item in value]
         return [number for part in parts for number in part] if all(parts) else []
@@ -176,7 +175,7 @@ def _numbers(value: Any) -> list[float]:
 
 
 def _shape(value: Any) -> Any:
-    """Return the shape of nested lists, with None in place of each number."""
+    """Return nested lists with None in place of each number, for comparisons of shapes."""
     return [_shape(item) for item in value] if isinstance(value, list) else None
 
 
@@ -211,7 +210,7 @@ class SweepSettings(Section):
 
     @property
     def distributions(self) -> dict[str, Distribution]:
-        """Distributions of the variables and the varied keys, in the order of the dimensions and of the columns."""
+        """Distributions of the variables, then of the varied keys, in the order of dimensions and columns."""
         return {**self.variables, **self.vary}
 
     @property
@@ -241,7 +240,7 @@ class SweepSettings(Section):
         return variables
 
     @model_validator(mode="after")
-    def _fits(self) -> Self:
+    def _is_consistent(self) -> Self:
         varied = self.distributions
         if not varied:
             raise scene_fault("no keys; name at least one, such as tissue.young: {uniform: [1e4, 3e4]}", "vary")
@@ -273,11 +272,11 @@ class SweepSettings(Section):
 
 
 def spread(total: int, limit: int) -> list[int]:
-    """Return numbers of evenly spaced runs.
+    """Return the numbers of evenly spaced runs.
 
     Args:
         total: number of runs.
-        limit: maximum number of returned runs.
+        limit: largest number of spaced runs.
     """
     count = min(total, limit)
     return [(2 * n + 1) * total // (2 * count) for n in range(count)]
@@ -285,7 +284,7 @@ def spread(total: int, limit: int) -> list[int]:
 
 @dataclass(frozen=True)
 class Sweep:
-    """Scene file and the variation of its keys; paths in the values are relative to the scene file."""
+    """Scene file, and variation of its keys; paths in the values are relative to the scene file."""
 
     scene: scene_file.ParsedFile
     settings: SweepSettings
@@ -297,17 +296,17 @@ class Sweep:
 
     @property
     def runs(self) -> int:
-        """The number of runs."""
+        """Number of runs."""
         return self.settings.runs
 
     def values(self, limit: int = MAX_RUNS) -> list[list[Any]]:
-        """Compute the values of the variables and the varied keys, in their order, for each run.
+        """Compute the values of the variables and the varied keys for each run, in the order of `keys`.
 
-        Without `samples` the runs are all combinations of the grids, the last key varying fastest. Otherwise they are
-        the first points of a scrambled Sobol sequence, with a dimension for every number and choice.
+        With `samples`, the runs are the first points of a scrambled Sobol sequence, which has a dimension for every
+        number and choice. Without, they are all combinations of the grids, of which the last key varies fastest.
 
         Args:
-            limit: number of runs, if there are more: the first ones of the sequence, or evenly spaced combinations.
+            limit: largest number of runs: the first points of the sequence, or evenly spaced combinations.
 
         Source: Owen, "Randomly permuted (t,m,s)-nets and (t,s)-sequences", 1995; SciPy's `qmc.Sobol`.
         """
@@ -318,8 +317,8 @@ class Sweep:
         from scipy.stats import qmc
 
         counts = [distribution.dimensions for distribution in distributions]
-        # Versions of SciPy derive different generators from an integer seed. SciPy warns unless the number of points is
-        # a power of two.
+        # A generator as seed, as versions of SciPy derive different ones from an integer. SciPy warns unless the number
+        # of points is a power of two.
         sequence = qmc.Sobol(sum(counts), scramble=True, seed=np.random.default_rng(self.settings.seed))
         count = min(self.runs, limit)
         points = sequence.random_base2(math.ceil(math.log2(count)))[:count]
@@ -330,7 +329,7 @@ class Sweep:
         return [list(values) for values in zip(*columns, strict=True)]
 
     def _combination(self, run: int) -> list[Any]:
-        """Return the combination of grid values of a run."""
+        """Return the values of a run on the grids."""
         values = []
         for distribution in reversed(self.settings.distributions.values()):
             run, index = divmod(run, len(distribution.values))
@@ -338,9 +337,9 @@ class Sweep:
         return values[::-1]
 
     def overrides(self, values: list[Any]) -> tuple[str, ...]:
-        """Return the arguments of `run --set` for a run.
+        """Return the arguments of `run --set` for the values of a run.
 
-        A key whose expression has no value is set to the text of its error, so that the run is refused.
+        A key whose expression has no value gets the message of the error as its value, so that the run is refused.
         """
         settings, count = self.settings, len(self.settings.variables)
         variables = dict(zip(settings.variables, values[:count], strict=True))
@@ -355,7 +354,7 @@ class Sweep:
 
     @cached_property
     def files(self) -> dict[str, str]:
-        """SHA-256 by path of every readable file that a run may use."""
+        """SHA-256 of every readable file that a run may use, by path."""
         names: list[str] = []
 
         def collect(_: Key, text: str) -> str:
@@ -376,11 +375,11 @@ class Sweep:
 
     @cached_property
     def digests(self) -> frozenset[str]:
-        """The digests of `files`."""
+        """SHA-256 of all `files`."""
         return frozenset(self.files.values())
 
     def description(self) -> dict[str, Any]:
-        """Return all settings that affect the results, as JSON data; equal sweeps have equal descriptions."""
+        """Return everything that affects the results, as JSON data; equal sweeps have equal descriptions."""
         settings = self.settings
         variables, vary = (
             {name: {distribution.kind: distribution.values} for name, distribution in section.items()}
@@ -388,7 +387,7 @@ class Sweep:
         )
         return {
             **settings.model_dump(include={"samples", "seed", "set"}),
-            **({"variables": variables} if variables else {}),  # Sweeps without them keep their description.
+            **({"variables": variables} if variables else {}),  # Absent in records of earlier versions.
             "vary": vary,
             "digest": hashlib.sha256(json.dumps(self.scene.document.data).encode()).hexdigest(),
             "files": {os.path.relpath(path, self.scene.folder): digest for path, digest in self.files.items()},
@@ -404,7 +403,7 @@ def load_sweep(path: str | Path) -> Sweep:
     draft = scene_file.Draft(scene_file.read_file(str(path), scene_file.FileKind("sweep", "scene and vary")))
     if "sheet" in draft.data and not {"vary", "variables"} & draft.data.keys():
         raise SceneError([f"{path}:1:1: a scene; use `taichi-msm run`, or name it by `scene:` in a sweep file"])
-    sweep, problems = _checked(draft.data, Path(path).parent)
+    sweep, problems = _check(draft.data, Path(path).parent)
     draft.report(problems)
     if sweep is None or draft.problems:
         raise SceneError(draft.lines())
@@ -419,7 +418,7 @@ def make_sweep(scene: str | Path, settings: Mapping[str, Any]) -> Sweep:
         settings: content of a sweep file, without `scene`.
 
     Returns:
-        The sweep; its fixed and varied paths are relative to the scene file.
+        The sweep; its paths are relative to the scene file.
 
     Raises:
         ArgumentError: when a value cannot be represented in JSON.
@@ -429,14 +428,14 @@ def make_sweep(scene: str | Path, settings: Mapping[str, Any]) -> Sweep:
         data = json.loads(json.dumps({**settings, "scene": Path(scene).name}))
     except (TypeError, ValueError) as error:
         raise ArgumentError(f"vary, variables, overrides: {error}; use numbers, text, lists, dicts") from None
-    sweep, problems = _checked(data, Path(scene).parent)
+    sweep, problems = _check(data, Path(scene).parent)
     if sweep is None or problems:
         raise SceneError([str(problem) for problem in problems])
     return sweep
 
 
-def _checked(data: dict[str, Any], folder: Path) -> tuple[Sweep | None, list[Problem]]:
-    """Check the content of a sweep file in a folder, and read its scene; return the sweep and all errors."""
+def _check(data: dict[str, Any], folder: Path) -> tuple[Sweep | None, list[Problem]]:
+    """Check the content of a sweep file in a folder, and read its scene; return the sweep, or None, and the errors."""
     problems: list[Problem] = []
     sections = (data.get(name) for name in ("variables", "vary", "set"))
     variables, vary, fixed = (section if isinstance(section, dict) else {} for section in sections)
@@ -445,8 +444,8 @@ def _checked(data: dict[str, Any], folder: Path) -> tuple[Sweep | None, list[Pro
         path = folder / name
         problems += _relocate(vary, fixed, folder, path.parent)
         try:
-            # The name has no folder: errors of runs must not depend on the current directory.
-            file = scene_file.read_file(_normalised(path), scene_file.SCENE_KIND)._replace(name=path.name)
+            # A name without folder, as errors of runs must not depend on the current directory.
+            file = scene_file.read_file(_normalise(path), scene_file.SCENE_KIND)._replace(name=path.name)
             problems += _unknown_keys(file, vary, fixed)
         except SceneError as error:
             problems.append(Problem(("scene",), error.lines[0]))
@@ -456,7 +455,7 @@ def _checked(data: dict[str, Any], folder: Path) -> tuple[Sweep | None, list[Pro
 
 
 def _expression_problems(variables: dict[str, Any], fixed: dict[str, Any]) -> list[Problem]:
-    """Return the errors of the expressions in `set` that do not depend on the values of the variables."""
+    """Return the errors in the expressions of `set` that do not depend on the values of variables."""
     names = dict.fromkeys(variables, math.nan)
     problems = []
 
@@ -470,7 +469,7 @@ def _expression_problems(variables: dict[str, Any], fixed: dict[str, Any]) -> li
     return problems
 
 
-def _normalised(path: Path) -> str:
+def _normalise(path: Path) -> str:
     """Remove .. from a path, unless symbolic links make the result another file."""
     short = Path(os.path.normpath(path))
     try:
@@ -480,7 +479,7 @@ def _normalised(path: Path) -> str:
 
 
 def format_override(value: Any) -> str:
-    """Format a value for `--set`."""
+    """Format a value for `--set`, text without quotes where YAML reads it as text."""
     if isinstance(value, str):
         with suppress(UnreadableError):
             document = read_yaml(value)
@@ -489,14 +488,14 @@ def format_override(value: Any) -> str:
     return json.dumps(value, ensure_ascii=False)
 
 
-def _relocate(vary: dict[str, Any], fixed: dict[str, Any], folder: Path, home: Path) -> Iterator[Problem]:
-    """Expand file patterns, and convert paths relative to `folder` to paths relative to `home`, the scene's folder."""
-    places: list[tuple[Key, Any]] = []  # key of each value, and the list or mapping that contains it
+def _relocate(vary: dict[str, Any], fixed: dict[str, Any], folder: Path, scene_folder: Path) -> Iterator[Problem]:
+    """Expand file patterns, and make paths relative to the scene's folder; in place. Yield the errors."""
+    places: list[tuple[Key, Any]] = []  # key of each value, and the list or dict that contains it
     for name, distribution in vary.items():
         for kind in {"choice", "grid"} & set(distribution if isinstance(distribution, dict) else ()):
             key = _split_key(name)
             if isinstance(pattern := distribution[kind], str) and scene_file.names_file(key):
-                distribution[kind] = _matches(pattern, folder, key)
+                distribution[kind] = _matching_files(pattern, folder, key)
                 if not distribution[kind]:
                     noun = _file_noun(key)
                     message = f"{format_value(pattern)} matches no {noun}; give a pattern relative to the sweep file"
@@ -506,24 +505,24 @@ def _relocate(vary: dict[str, Any], fixed: dict[str, Any], folder: Path, home: P
     places += [(("set", name), fixed) for name in fixed]
     problems = []
 
-    def relocated(place: Key, key: Key, text: str) -> str:
+    def relocate(place: Key, key: Key, text: str) -> str:
         path, noun = folder / text, _file_noun(key)
-        if not (scene_file.is_below(path, folder) or scene_file.is_below(path, home)):
+        if not (scene_file.is_below(path, folder) or scene_file.is_below(path, scene_folder)):
             message = f"{text} is neither below the sweep file's folder nor below the scene's; put the {noun} there"
             problems.append(Problem(place, message))
         elif not os.path.isfile(path):  # noqa: PTH113  # Path.is_file raises an error for a long name
             message = f"{truncate(text)}: no such file; name a {noun} relative to the sweep file"
             problems.append(Problem(place, message))
-        # Resolve links first: .. after a symbolic link is the parent of its target.
-        return Path(os.path.relpath(path.parent.resolve() / path.name, home.resolve())).as_posix()
+        # Links are resolved first, as .. after a symbolic link is the parent of its target.
+        return Path(os.path.relpath(path.parent.resolve() / path.name, scene_folder.resolve())).as_posix()
 
     for place, container in places:
-        container[place[-1]] = _map_files(_split_key(str(place[1])), container[place[-1]], partial(relocated, place))
+        container[place[-1]] = _map_files(_split_key(str(place[1])), container[place[-1]], partial(relocate, place))
     yield from problems
 
 
-def _matches(pattern: str, folder: Path, key: Key) -> list[str]:
-    """Return the files of a key that match a pattern relative to a folder."""
+def _matching_files(pattern: str, folder: Path, key: Key) -> list[str]:
+    """Return the files that match a pattern relative to a folder; for a key of pictures, only pictures."""
     suffixes = PICTURE_SUFFIXES if key in scene_file.PICTURE_KEYS else ("",)
     names = sorted(glob(pattern, root_dir=folder))  # noqa: PTH207  # Path.glob refuses absolute patterns
     return [text for text in names if text.lower().endswith(suffixes) and (folder / text).is_file()]
@@ -534,7 +533,7 @@ def _file_noun(key: Key) -> str:
 
 
 def _map_files(path: Key, value: Any, change: Callable[[Key, str], str]) -> Any:
-    """Apply a function to the file paths in the value of a key."""
+    """Return a copy of the value of a key, with a function applied to its file paths."""
     if scene_file.names_file(path):
         return change(path, value) if isinstance(value, str) and 0 < len(value) <= MAX_PATH else value
     if isinstance(value, dict):
@@ -543,12 +542,12 @@ def _map_files(path: Key, value: Any, change: Callable[[Key, str], str]) -> Any:
 
 
 def _split_key(name: str) -> Key:
-    """Split a dotted key; empty if `--set` does not accept it."""
+    """Split a dotted key; empty if it is invalid for `--set`."""
     return scene_file.parse_key(name.strip()) if "=" not in name else ()
 
 
 def _unknown_keys(scene: scene_file.ParsedFile, vary: dict[str, Any], fixed: dict[str, Any]) -> Iterator[Problem]:
-    """Yield an error for each key that the scene does not have; one value of each key is tried."""
+    """Yield an error for each key that a scene cannot have, by trying one value of each key."""
     trials: dict[Key, Any] = {("set", name): value for name, value in fixed.items()}
     for name, distribution in vary.items():
         values = next(iter(distribution.values()), None) if isinstance(distribution, dict) else None
@@ -560,14 +559,14 @@ def _unknown_keys(scene: scene_file.ParsedFile, vary: dict[str, Any], fixed: dic
             yield Problem(path, "not a key; expected a dotted path such as sheet.points")
             continue
         keys[path] = key
-        known = len(draft.problems)
-        # Copied, as later overrides may change a part of the value.
+        earlier = len(draft.problems)
+        # A copy, as later overrides may change a part of the value.
         draft.override(scene_file.Override("", key, deepcopy(value)))
-        yield from (Problem(path, problem.message) for _, problem in draft.problems[known:])
+        yield from (Problem(path, problem.message) for _, problem in draft.problems[earlier:])
     for problem in parse_model(Scene, draft.data)[1]:
         if not problem.message.startswith("unknown key"):
             continue
-        # The unknown key is a prefix of a tried key, a key in its value, or a key of the scene file.
+        # The unknown key is the beginning of a tried key, a key within its value, or a key of the scene file.
         related = [
             path
             for path, key in keys.items()

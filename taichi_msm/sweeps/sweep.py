@@ -1,4 +1,4 @@
-"""Python interface of sweeps, and the steps that it shares with the command line."""
+"""Python interface of sweeps, and the functions that it shares with the command line."""
 
 from __future__ import annotations
 
@@ -50,18 +50,18 @@ def sweep(
 
     Args:
         scene: path of the scene file.
-        vary: distributions by dotted key, as in a sweep file; paths are relative to the scene file, and below its
-            folder.
-        directory: receives runs/, table.csv and the other reports.
+        vary: distributions by dotted key, as in a sweep file; paths are relative to the folder of the scene file, and
+            within it.
+        directory: directory for runs/, table.csv and the other reports.
         variables: distributions of the numbers in expressions of `overrides`, by name, as in a sweep file.
         samples: number of runs; None for all combinations of the grids.
         seed: seed of the samples.
         overrides: values of keys in all runs, by dotted key; texts that begin with = are expressions of the variables.
-        executor: executor of the runs, whose workers are processes with one thread and the same paths of scene and
-            directory; the address of a dask.distributed scheduler; or None for processes on this machine.
+        executor: None for processes on this machine; the address of a dask.distributed scheduler; or an executor
+            whose workers are processes with one thread and find scene and directory at the same paths.
         workers: number of processes on this machine, by default one per core, limited by the free memory.
-        progress: called often with the stage, the finished and the total number of runs; its exceptions stop the
-            sweep.
+        progress: called often with the stage, and the finished and total number of runs; an exception from it stops
+            the sweep.
 
     Returns:
         An iterator over the outcomes of all runs.
@@ -88,7 +88,7 @@ def sweep(
     settings = {"variables": variables or {}, "vary": vary, "seed": seed, "set": overrides or {}}
     settings |= {} if samples is None else {"samples": samples}
     spec = make_sweep(scene, settings)
-    # The caller may change the current directory meanwhile.
+    # Absolute, as the caller may change the current directory before iterating.
     state = begin_sweep(spec, Path(directory).absolute())
     worker_count = choose_worker_count(estimate_cost(spec), len(state.missing), workers).number
 
@@ -111,14 +111,14 @@ def open_executor(
         executor: an executor; the address of a dask scheduler; or None for a new `Pool`.
         workers: number of processes of the pool.
         state: the sweep.
-        progress: called while waiting for the first worker of a cluster.
+        progress: called while the first worker of a cluster is awaited.
 
     Yields:
         The opened executor.
 
     Raises:
         NotInstalledError: when dask.distributed is needed and not installed.
-        ExecutorError, LostExecutorError: as `cluster.cluster_connection`.
+        ExecutorError, LostExecutorError: as by `cluster.cluster_connection`.
     """
     if isinstance(executor, str):
         try:
@@ -149,14 +149,14 @@ def finish_sweep(state: SweepState, executor: Executor, progress: StageProgressC
         progress: called while another command writes the reports, and while frames are drawn.
 
     Returns:
-        Names of the written files, and warnings, as `tables.write_reports`.
+        Names of the written files, and warnings, of `tables.write_reports`.
     """
     directory, total = state.directory, len(state.values)
     with writing(directory), lock_reports(directory, lambda: progress("runs", total, total)):
-        # A run that was locked by another command may be finished now.
+        # Another command may have finished a run that it had locked.
         tasks = {task.run: task for task in state.missing}
         state.outcomes[:] = [
-            (None if row.status in FINAL_STATUSES else read_outcome(tasks[row.run], state.sweep)) or row
-            for row in sorted(state.outcomes, key=lambda row: row.run)
+            (None if outcome.status in FINAL_STATUSES else read_outcome(tasks[outcome.run], state.sweep)) or outcome
+            for outcome in sorted(state.outcomes, key=lambda outcome: outcome.run)
         ]
         return write_reports(state, executor, progress)

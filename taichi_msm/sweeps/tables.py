@@ -1,8 +1,4 @@
-"""Reports of a sweep: table, description of the data set, plots, summary, and cost estimate.
-
-Runs are sorted by the SHA-256 of "SEED RUN": the first tenth is the test split, the second tenth the validation split.
-The split of a run depends only on the seed, the number of the run and the number of runs.
-"""
+"""Reports of a sweep: table, description of the data set, plots, summary; and its cost estimate."""
 
 from __future__ import annotations
 
@@ -21,7 +17,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from taichi_msm.errors import SceneError, StageProgressCallback, writing
+from taichi_msm.errors import SceneError, StageProgressCallback
 from taichi_msm.load import cost
 from taichi_msm.load.scene_file import plan_file
 from taichi_msm.model.plan import Plan
@@ -48,13 +44,10 @@ def write_reports(
     Args:
         state: the finished sweep.
         executor: executor that draws the frames of runs without pictures.
-        progress: called with the stage, the drawn and the total number of frames.
+        progress: called with the stage, and the drawn and total number of frames.
 
     Returns:
-        Names of the written files, and warnings, including failures of reports other than the table.
-
-    Raises:
-        FilesError: when the table cannot be written.
+        Names of the written files; and warnings, such as the failure of a report other than the table.
     """
     writers: dict[str, Callable[[SweepState, list[str]], list[str]]] = {
         "table.parquet": write_parquet,
@@ -63,23 +56,22 @@ def write_reports(
         "sweep.png": _write_plots,
     }
     written, notes = ["table.csv"], list[str]()
-    with writing(state.directory):
-        write_table(state)
-        for name, write in writers.items():
-            try:
-                notes += write(state, written)
-            except Exception as error:
-                # A failing report must not discard hours of runs.
-                notes.append(f"{name} could not be written: {type(error).__name__}: {error}")
-        for path in (state.directory / name for name in REPORT_FILES if name not in written):
-            if not path.is_dir():
-                path.unlink(missing_ok=True)
+    write_table(state)
+    for name, write in writers.items():
+        try:
+            notes += write(state, written)
+        except Exception as error:
+            # A failing report must not discard hours of runs.
+            notes.append(f"{name} could not be written: {type(error).__name__}: {error}")
+    for path in (state.directory / name for name in REPORT_FILES if name not in written):
+        if not path.is_dir():
+            path.unlink(missing_ok=True)
     return written, notes
 
 
 def _write_plots(state: SweepState, written: list[str]) -> list[str]:
-    """Write sensitivity.csv if there are enough runs, and sweep.png if complete runs differ; return warnings."""
-    # More runs would slow down the plots without changing them visibly.
+    """Write sensitivity.csv if runs suffice, and sweep.png if complete runs differ; return warnings."""
+    # More runs would slow down the plots without visible change.
     runs = spread(len(state.outcomes), 4096)
     varied, columns = plots.varied_parameters(state, runs), plots.varied_results(state, runs)
     if not (varied and columns):
@@ -122,7 +114,7 @@ def write_parquet(state: SweepState, written: list[str]) -> list[str]:
         written: names of the written reports; table.parquet is appended.
 
     Returns:
-        An empty list; reports return their warnings.
+        No warnings.
     """
     try:
         import pyarrow
@@ -131,7 +123,7 @@ def write_parquet(state: SweepState, written: list[str]) -> list[str]:
         return []
     columns: dict[str, Any] = _columns(state)
     for name in state.sweep.keys:
-        # Columns of mixed types, such as numbers and lists, become text.
+        # A column of mixed types, such as numbers and lists, becomes text.
         try:
             pyarrow.array(columns[name])
         except pyarrow.ArrowException:
@@ -166,20 +158,20 @@ def csv_line(row: Iterable[Any]) -> str:
 
 
 def write_dataset(state: SweepState, written: list[str]) -> list[str]:
-    """Write dataset.json, with a line for every complete run.
+    """Write dataset.json, with one line for each complete run.
 
     Args:
         state: the finished sweep.
         written: names of the written reports; dataset.json is appended.
 
     Returns:
-        An empty list; reports return their warnings.
+        No warnings.
     """
     sweep, complete = state.sweep, [outcome.run for outcome in state.outcomes if outcome.status == "complete"]
     common = _output_format(state.run_directory(complete[0])) if complete else {}
-    # The sections of a scene that determine the output format.
     settings = sweep.settings
     expressions = (key for key, value in settings.set.items() if replace_expressions(value, lambda *_: None) != value)
+    # These sections of the scene determine the format of a run.
     differ = any(key.split(".")[0] in ("output", "render", "time") for key in (*settings.vary, *expressions))
     splits = assign_splits(len(state.outcomes), settings.seed)
     head = {"scene": settings.scene, **sweep.description(), "versions": versions(), "commit": commit(), **common}
@@ -203,6 +195,9 @@ def write_dataset(state: SweepState, written: list[str]) -> list[str]:
 def assign_splits(runs: int, seed: int) -> list[str]:
     """Return the split of every run: "train", "val" or "test".
 
+    In the order of the SHA-256 of "SEED RUN", the first tenth of the runs is the test split, and the second tenth the
+    validation split. So the split of a run depends only on the seed, its number and the number of runs.
+
     Args:
         runs: number of runs.
         seed: seed of the sweep.
@@ -216,7 +211,7 @@ def assign_splits(runs: int, seed: int) -> list[str]:
 
 
 def _output_format(directory: Path) -> dict[str, Any]:
-    """Read the outputs, number of frames, frame size [px] and frame rate of a run, for data loaders."""
+    """Read the outputs, number of frames, frame size [px] and frame rate of a run."""
     record = json.loads(read_regular(directory / RUN_RECORD, MAX_RECORD_BYTES))
     scene = record["scene"]
     return {
@@ -232,12 +227,12 @@ def _json(value: Any) -> bytes:
 
 
 def cost_line(runs: int, expected: SweepCost, workers: WorkerCount | None) -> str:
-    """Return the expected cost of runs as a line.
+    """Return the estimated cost of runs as text.
 
     Args:
         runs: number of runs.
         expected: cost of the runs.
-        workers: number of processes of this machine; None for a cluster.
+        workers: number of processes on this machine; None for a cluster.
     """
     location = "if they were run here"
     if workers is not None:
@@ -257,9 +252,9 @@ def summary_lines(
     """Summarise a sweep: the number of runs with each status, an example of each failure, and the reports.
 
     Args:
-        directory: of the sweep.
-        outcomes: of the sweep or shard.
-        shard: part I of N as (I, N); None for the whole sweep.
+        directory: directory of the sweep.
+        outcomes: outcomes of the sweep or shard.
+        shard: shard I of N as (I, N); None for the whole sweep.
         files: names of the reports.
         notes: warnings about the reports.
 
@@ -279,7 +274,7 @@ def summary_lines(
             largest, run = max(errors)
             statistics = f"median {median(error for error, _ in errors):.2g}, largest {largest:.2g} (run {run:06})"
             lines.append(f"error, as a fraction of the largest displacement, due to {cause}: {statistics}")
-    # One example of each of the five most frequent warnings; warnings that differ only in numbers are one group.
+    # Warnings that differ only in numbers are a group; the five largest groups have an example each.
     groups: dict[str, list[str]] = {}
     for outcome in outcomes:
         for note in outcome.notes:
@@ -299,21 +294,21 @@ def count_statuses(outcomes: Sequence[Outcome]) -> dict[str, int]:
     return {status: counts[status] for status in STATUSES}
 
 
-# Memory of a process without its run: Python, compiler, kernels [bytes].
+# Memory of a process for Python, compiler and kernels, without its run [bytes].
 PROCESS_BYTES = 400 << 20
 
-# Overhead per run and per frame [s]: directories, files, calls; measured on Zen 4.
+# Overhead of a run and of a frame [s], for directories, files and calls; measured on Zen 4.
 RUN_OVERHEAD_S, FRAME_OVERHEAD_S = 0.04, 0.003
 
 
 class SweepCost(NamedTuple):
-    """Estimated cost of the runs of a sweep; its fields are keys of the JSON of --dry-run."""
+    """Estimated cost of the runs of a sweep; its fields are keys in the JSON of --dry-run."""
 
     seconds: float  # on all cores of this machine
     disk_bytes: int  # upper bound
     memory_bytes: int  # of one process
-    looked_at: int  # number of runs in the estimate
-    refused: int  # number of these runs with invalid values
+    looked_at: int  # number of checked runs
+    refused: int  # number of checked runs with invalid values
     example: str  # error of a refused run
 
     def scaled(self, fraction: float) -> SweepCost:
@@ -330,7 +325,7 @@ class WorkerCount(NamedTuple):
 
 
 def estimate_cost(sweep: Sweep) -> SweepCost:
-    """Estimate the cost of a sweep from at most 64 of its runs."""
+    """Estimate the cost of a sweep from up to 64 of its runs."""
     plans, errors = list[Plan](), list[str]()
     for values in sweep.values(64):
         try:
@@ -343,7 +338,7 @@ def estimate_cost(sweep: Sweep) -> SweepCost:
     seconds = sum(duration.seconds - duration.start for duration in durations)
     seconds += sum(RUN_OVERHEAD_S + FRAME_OVERHEAD_S * budget.frames for budget in budgets) / cores
     return SweepCost(
-        # A process starts once for many runs.
+        # The start of a process counts once.
         seconds=max((duration.start for duration in durations), default=0.0) + scale * seconds,
         disk_bytes=round(scale * sum(budget.disk_bytes for budget in budgets)),
         memory_bytes=PROCESS_BYTES + max((budget.memory_bytes for budget in budgets), default=0),
@@ -359,7 +354,7 @@ def choose_worker_count(expected: SweepCost, runs: int, requested: int | None = 
     Args:
         expected: cost of the sweep, with the memory of a process.
         runs: number of runs.
-        requested: number of processes requested by the user, without limits; None for the automatic choice.
+        requested: number that the user requests, which is not limited; None to choose.
 
     Returns:
         The number and its limits.

@@ -96,9 +96,9 @@ class Compiler:
     def patches(self) -> Patches:
         """Patches for faster parsing of the kernels of this package; empty for an untested version.
 
-        A compiler parses all kernels in every process, because the keys of its cache depend on the parsed kernels.
-        Patched, it looks up the source of a function once, not at every call, and omits the source lines that it
-        prepares for error messages at every node.
+        A compiler parses all kernels in every process, because the keys of its cache depend on the parsed kernels. With
+        the patches it looks up the source of a function once, not at every call, and does not prepare the source lines
+        of every node for error messages.
         """
         if "TAICHI_MSM_TRACEBACK" in os.environ or self.version != self.tested_version:
             return []

@@ -7,7 +7,6 @@ KeyboardInterrupt at places where it can stop.
 
 from __future__ import annotations
 
-import contextlib
 import io
 import math
 import os
@@ -35,18 +34,18 @@ def available_threads() -> int:
 
 def _quota(group: Path) -> float | None:
     """Read the number of cores that a control group (version 2 or 1) may use; None without a limit."""
-    with contextlib.suppress(OSError, ValueError):
+    with suppress(OSError, ValueError):
         quota, period = map(int, (group / "cpu.max").read_text().split())
         return quota / period
-    with contextlib.suppress(OSError, ValueError):
+    with suppress(OSError, ValueError):
         quota, period = (int((group / f"cpu.cfs_{name}_us").read_text()) for name in ("quota", "period"))
         return quota / period if quota > 0 else None
     return None
 
 
 def _control_groups(controller: str) -> Iterator[Path]:
-    """List the control groups of this process and their ancestors, of version 2 and of a controller of version 1."""
-    with contextlib.suppress(OSError):
+    """Yield the control groups of this process and their ancestors: of version 2, and a controller's of version 1."""
+    with suppress(OSError):
         for line in MEMBERSHIP.read_text().splitlines():
             number, controllers, path = line.split(":", 2)
             if number != "0" and controller not in controllers.split(","):
@@ -67,7 +66,7 @@ def core_wait_s(tasks: Path = Path("/proc/self/task")) -> float | None:
 
 def processor_name() -> str:
     """Return the name of the processor."""
-    with contextlib.suppress(OSError):
+    with suppress(OSError):
         for line in Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines():
             if line.startswith("model name"):
                 return line.split(":", 1)[1].strip()
@@ -79,7 +78,7 @@ def available_memory() -> int:
 
     Without /proc, returns the physical memory, or sys.maxsize if the system does not report it.
     """
-    with contextlib.suppress(OSError, KeyError, ValueError, IndexError):
+    with suppress(OSError, KeyError, ValueError, IndexError):
         free = _free_memory(Path("/proc/meminfo"))
         return min([free, *map(_group_memory, _control_groups("memory"))])
     try:
@@ -100,7 +99,7 @@ def _group_memory(group: Path) -> int:
         ("memory.max", "memory.current", "inactive_file"),
         ("memory.limit_in_bytes", "memory.usage_in_bytes", "total_inactive_file"),
     ):
-        with contextlib.suppress(OSError, ValueError):
+        with suppress(OSError, ValueError):
             maximum, used = (int((group / name).read_text()) for name in (limit, usage))
             cached = dict(line.split() for line in (group / "memory.stat").read_text().splitlines())
             # Cached files count as used, but the kernel drops them on demand.

@@ -21,10 +21,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from taichi_msm.errors import ArgumentError, DeviceError, MsmError, did_you_mean
-from taichi_msm.system import process as process_module
 from taichi_msm.system.compiler import Patches, active_compiler
 from taichi_msm.system.files import private_folder
-from taichi_msm.system.process import discarded_output
+from taichi_msm.system.process import available_threads, discarded_output, processor_name
 
 ti = active_compiler().load()
 
@@ -130,7 +129,7 @@ def current_device() -> Device:
 
 
 def start(arch: str = "cpu", threads: int | None = None) -> Device:
-    """Start Taichi; if it already runs on the same device, only return it.
+    """Start Taichi on a device, unless it already runs on it.
 
     Args:
         arch: cpu, cuda or vulkan.
@@ -150,7 +149,7 @@ def start(arch: str = "cpu", threads: int | None = None) -> Device:
     if arch not in ARCHS:
         hint = did_you_mean(str(arch), ARCHS)
         raise DeviceError(f"--arch {arch}: not supported; take one of: {', '.join(ARCHS)}{hint}")
-    wanted = Device(arch, process_module.available_threads() if threads is None else threads)
+    wanted = Device(arch, available_threads() if threads is None else threads)
     with _start_lock:
         if _device is None:
             _device = replace(wanted, name=_initialise(wanted))
@@ -174,14 +173,13 @@ def stop() -> None:
 
 def require_start_thread() -> None:
     """Require the process and thread that started Taichi, the only ones that can use it; else raise an MsmError."""
-    process, thread = _start_thread
+    (process, thread), title = _start_thread, active_compiler().title
     if process != os.getpid():
         raise MsmError(
-            f"{active_compiler().title} was started before this process was forked from another, and would hang here; "
-            "start processes by multiprocessing's 'spawn' or 'forkserver'"
+            f"{title} was started before this process was forked from another, and would hang here; start processes by "
+            "multiprocessing's 'spawn' or 'forkserver'"
         )
     if thread != threading.get_ident():
-        title = active_compiler().title
         raise MsmError(f"{title} only works in the thread that started it; simulate and draw in that thread")
 
 
@@ -265,7 +263,7 @@ def _thread_ids() -> list[int]:
 
 
 def _pin(pool: list[int]) -> None:
-    """Pin each thread of Taichi's pool to a core, if it has one per core; threads that share a core spin for 10 ms."""
+    """Pin Taichi's threads to the cores if their numbers are equal; threads that share a core would spin for 10 ms."""
     if hasattr(os, "sched_setaffinity") and len(pool) == len(os.sched_getaffinity(0)):
         for thread, core in zip(pool, sorted(os.sched_getaffinity(0)), strict=True):
             with contextlib.suppress(OSError):
@@ -318,5 +316,5 @@ def _initialise(device: Device) -> str:
     # Taichi starts the threads of its pool last.
     _pin([thread for thread in _thread_ids() if thread not in earlier_threads][-device.threads :])
     if on_cpu:
-        return process_module.processor_name()
+        return processor_name()
     return next(filter(None, gpu_name.groups())) if gpu_name else ""

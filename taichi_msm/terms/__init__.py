@@ -41,13 +41,14 @@ def derive_material(scene: Scene, maps: Maps) -> Material:
 
     Args:
         scene: a scene without `material_key_problems`.
-        maps: images of its stiffness maps by key; missing ones are ignored.
+        maps: images of the scene's stiffness maps by key; missing ones are ignored.
 
     Returns:
         Coefficients of the sheet.
     """
     (dx, dy), mass = spacing(scene.sheet), scene.sheet.mass
-    readable = {key: (keys, maps[key], scene.sheet) for key, keys in scene.maps.items() if key in maps}
+    samplers = {"map": cell_factors, "foundation_map": point_factors}
+    factors = {key: samplers[key](scene.maps[key], maps[key], scene.sheet) for key in scene.maps.keys() & maps.keys()}
     if scene.tissue is not None:
         mass = (scene.tissue.density or 0.0) * scene.tissue.thickness * (dx * dy)
     if scene.time.at_rest:
@@ -57,8 +58,8 @@ def derive_material(scene: Scene, maps: Maps) -> Material:
     return Material(
         mass=mass,
         by_area=scene.tissue is not None,
-        factors=cell_factors(*readable["map"]) if "map" in readable else None,
-        virtual_factors=point_factors(*readable["foundation_map"]) if "foundation_map" in readable else None,
+        factors=factors.get("map"),
+        virtual_factors=factors.get("foundation_map"),
         **derived,
     )
 
@@ -69,17 +70,20 @@ def build_terms(plan: Plan) -> tuple[Term, ...]:
 
 
 def memory_names(plan: Plan) -> tuple[str, ...]:
-    """Return the names of the numbers that the terms of a scene remember at every mass point."""
+    """Return the names of the state variables that the terms of a scene add to every mass point."""
     return tuple(name for term in build_terms(plan) for name in term.memory)
 
 
 def fictitious_masses(plan: Plan) -> NDArray[np.float64]:
-    """Compute fictitious masses [N/m] for which no angular frequency exceeds 1, shape (rows, cols)."""
+    """Compute fictitious masses of the mass points, shape (rows, cols) [N/m].
+
+    In their dimensionless time every angular frequency of the sheet is at most 1.
+    """
     return np.sum([np.broadcast_to(term.node_stiffness_bounds(plan), plan.fixed.shape) for term in TERMS], axis=0)
 
 
 def highest_frequency(material: Material, sheet: Sheet) -> float:
-    """Return a bound of the highest angular frequency [rad/s] of a sheet without springs below half their rest length.
+    """Return an upper bound of the angular frequencies [rad/s], valid while springs exceed half their rest length.
 
     Args:
         material: coefficients of the sheet.

@@ -1,4 +1,4 @@
-"""The interface of a term of the model, the compile-time configuration of kernels, and their views of a sheet."""
+"""Interface of a term of the model; compile-time configuration of kernels; sheet, row and entry within a kernel."""
 
 from __future__ import annotations
 
@@ -19,31 +19,30 @@ from taichi_msm.scene.scene import Scene
 from taichi_msm.scene.sheet import Sheet
 from taichi_msm.terms.law import Law, LawFunctions
 
-# Rows of the array by_column. MOBILITY and AREA_SHARE have three each: for the first, a middle and the last row.
+# Rows of the array `by_column`. MOBILITY and AREA_SHARE take three: for the first, inner and last rows of the sheet.
 MOBILITY, AREA_SHARE, REST_X, HAS_LEFT, HAS_RIGHT, COLUMN_ROWS = 0, 3, 6, 7, 8, 9
 
 # Indices of the constants of a sheet: dx, dy and y of the first row [m], followed by the constants of its terms.
 DX, DY, TOP_Y, GEOMETRY_COUNT = range(4)
 
-# The first column of the load table: the gain, change of the last difference per force [m/N]. Columns of terms follow.
+# First column of the load table: the gain of the step, displacement per force [m/N]. Columns of the terms follow.
 GAIN, STEP_COLUMNS = 0, 1
 
-# The first measure of a row: the sum of |d|^2 times the share of a cell's mass. Measures of terms follow.
+# First measure of a row: the sum of m |d|^2, with the mass m of a point relative to a cell's. Measures of terms follow.
 SQUARED_MOTION, STEP_MEASURES = 0, 1
 
 
 class Term(ABC):
-    """A term of the model, as a frozen dataclass of its compile-time configuration, without coefficients.
+    """Term of the model: a frozen dataclass with its compile-time configuration, without coefficients.
 
-    The kernels call springs and bending, the terms between mass points, by name, and all others through this interface
-    only.
+    Kernels call springs and bending, which act between mass points, by name, and all other terms by this interface.
     """
 
-    reach: ClassVar[int] = 0  # number of rows on either side on which the force on a row depends
-    constant_count: ClassVar[int] = 0  # number of the sheet's constants that belong to the term
+    reach: ClassVar[int] = 0  # rows on either side that affect the force on a row
+    constant_count: ClassVar[int] = 0  # number of the term's constants
     reductions: ClassVar[tuple[str, ...]] = ()  # reduction of each measure over a row: "min", "max" or "sum"
-    has_gradient: ClassVar[bool] = False  # whether `build_tangents` has all of its force that depends on displacements
-    key: ClassVar[str] = ""  # of the scene, for the message of a term without a gradient
+    has_gradient: ClassVar[bool] = False  # whether `build_tangents` linearises its whole force
+    key: ClassVar[str] = ""  # key of the scene, for messages of a term without a gradient
 
     @classmethod
     @abstractmethod
@@ -52,12 +51,12 @@ class Term(ABC):
 
     @staticmethod
     def derive(scene: Scene) -> dict[str, Any]:
-        """Derive the term's attributes of `Material`, by name, from its keys of a scene."""
+        """Derive attributes of `Material`, by name, from the term's keys of a scene."""
         return {}
 
     @staticmethod
     def stiffness_bound(material: Material, sheet: Sheet) -> float:
-        """Return a bound of the term's contribution to m w^2 [N/m], for the angular frequency w of any mode.
+        """Return an upper bound of the term's part of m w^2 [N/m], where w is the angular frequency of any mode.
 
         Args:
             material: coefficients of the sheet.
@@ -76,21 +75,21 @@ class Term(ABC):
 
     @property
     def column_count(self) -> int:
-        """Number of columns of the load table that belong to the term."""
+        """Number of the term's columns of the load table."""
         return 0
 
     @property
     def memory(self) -> tuple[str, ...]:
-        """Names of the numbers that the term remembers at every mass point: its last fields, which steps change."""
+        """Names of the term's state variables at every mass point. They are its last fields."""
         return ()
 
     def has_history(self, plan: Plan) -> bool:
-        """Return whether the shapes of a sheet at rest depend on earlier loads by the definition of the term."""
+        """Return whether the term makes equilibria depend on earlier loads."""
         return bool(self.memory)
 
     @property
     def field_count(self) -> int:
-        """Number of fields that belong to the term."""
+        """Number of the term's fields, arrays with a number per mass point."""
         return len(self.memory)
 
     def columns(self, plan: Plan, loads: Schedule, first: int) -> NDArray[Any]:
@@ -119,7 +118,7 @@ class Term(ABC):
     def build_forces(self, config: KernelConfig) -> Sequence[Callable[..., Any]]:
         """Build Taichi functions add(force, sheet, entry, now), which add the term's force on an entry.
 
-        In them `force` is a list of x, y and z, `sheet` a `KernelSheet`, `entry` an `Entry` and `now` a row of the load
+        Here `force` is a list of x, y and z, `sheet` a `KernelSheet`, `entry` an `Entry` and `now` a row of the load
         table as a list of variables.
         """
         return ()
@@ -127,16 +126,16 @@ class Term(ABC):
     def build_tangents(self, config: KernelConfig) -> Sequence[Callable[..., Any]]:
         """Build Taichi functions add(force, sheet, entry, now), which add the linearised change of the force.
 
-        In them `entry.u` and `sheet.u` contain changes of displacements, and `entry.shape` the displacement.
+        Here `entry.u` and `sheet.u` are changes of displacements, and `entry.displacement` is the displacement.
         """
         return ()
 
     def build_damping(self, config: KernelConfig) -> Sequence[Callable[..., Any]]:
-        """Build Taichi functions reduce(d, sheet), which scale the last difference d of an entry, a list of 3."""
+        """Build Taichi functions reduce(d, sheet), which damp the last difference d of an entry, a list of 3."""
         return ()
 
     def build_correction(self, config: KernelConfig) -> Correction | None:
-        """Build the functions that correct the displacements after a step; None if the term corrects nothing."""
+        """Build the functions that correct displacements after a step; None if the term corrects nothing."""
         return None
 
     def build_rest_correction(self, config: KernelConfig) -> RestCorrection | None:
@@ -144,22 +143,22 @@ class Term(ABC):
         return None
 
     def supports(self, compiled: Self) -> str:
-        """Return the reason why kernels compiled for another configuration of the term do not support this one."""
+        """Return why kernels compiled for another configuration of the term cannot run this one; empty if they can."""
         return ""
 
     def mark_update(self, columns: NDArray[Any]) -> bool:
-        """Mark the columns of a frame at rest, if the term changes its memory once the frame is in equilibrium.
+        """Request the update of the memory in the next evaluation of the forces, after a frame reached equilibrium.
 
         Args:
             columns: row of the load table, from the first column of the term on, in and out.
 
         Returns:
-            Whether the term changes its memory in the next evaluation of the forces.
+            Whether the term has such an update.
         """
         return False
 
     def build_measures(self, config: KernelConfig) -> Sequence[Callable[..., None]]:
-        """Build Taichi functions measure(measures, sheet, p, i, kind, b), for entry b of row i, which is row p of u."""
+        """Build Taichi functions measure(measures, sheet, p, i, kind, b) of entry b of row i, which is row p of u."""
         return ()
 
 
@@ -169,7 +168,7 @@ class Correction(NamedTuple):
     Attributes:
         reaches: reaches(sheet, i, low, high, now) returns whether row i may need a correction; `low` and `high` bound
             its displacements along y and z, two numbers each.
-        resolve: resolve(sheet, i, kind, at, b, now) corrects entry b of row i, which is row `at` of u.
+        resolve: resolve(sheet, i, kind, at, b, now) corrects entry b of row i, row `at` of u.
     """
 
     reaches: Callable[..., Any]
@@ -177,10 +176,10 @@ class Correction(NamedTuple):
 
 
 class RestCorrection(NamedTuple):
-    """Taichi functions that correct a `RestSheet`.
+    """Taichi functions that correct a sheet in quasi-static equilibrium.
 
     Attributes:
-        remove: remove(force, sheet, at) removes from the force on an entry the part that the term carries.
+        remove: remove(force, sheet, at) subtracts the part that the term carries from the force on entry `at`.
         project: project(sheet, i, kind, b, now) corrects entry b of row i after it moved.
     """
 
@@ -195,8 +194,8 @@ AnyTerm = TypeVar("AnyTerm", bound=Term)
 class KernelConfig:
     """Compile-time configuration of the kernels of a sheet; everything else is an argument of a kernel."""
 
-    precision: str  # of the numbers, f32 or f64
-    lanes: int  # number of lanes of a vector, and of strips of columns
+    precision: str  # f32 or f64
+    lanes: int  # number of lanes of a vector, one for each strip of columns
     by_area: bool  # whether mass points at an open edge are lighter, because they belong to fewer cells
     terms: tuple[Term, ...]  # terms of the scene in the order of `terms.TERMS`, always with springs and probes
 
@@ -246,7 +245,7 @@ class KernelConfig:
 
         Args:
             law: law of the springs.
-            tense: whether the springs have a tension at rest, see `Law.build`.
+            tense: whether the springs are under tension at rest.
         """
         return LawFunctions(*(self.ti.func(function) for function in law.build(self.operations, tense=tense)))
 
@@ -255,7 +254,7 @@ class KernelConfig:
         return next((term for term in self.terms if isinstance(term, kind)), None)
 
     def require(self, kind: type[AnyTerm]) -> AnyTerm:
-        """Return the term of a class that every scene has."""
+        """Return the term of a class; every scene has it."""
         term = self.get(kind)
         assert term is not None, kind
         return term
@@ -279,7 +278,7 @@ class KernelConfig:
         return [n for term, end in zip(self.terms, ends, strict=True) for n in range(end - len(term.memory), end)]
 
     def memory_slice(self, kind: type[Term]) -> slice:
-        """Return the part of `State.memory` that belongs to a term."""
+        """Return the slice of `State.memory` with the memory of a term."""
         begin = sum(len(term.memory) for term in self._before(kind))
         term = self.get(kind)
         return slice(begin, begin + (len(term.memory) if term else 0))
@@ -289,6 +288,7 @@ class KernelConfig:
         return STEP_MEASURES + sum(len(term.reductions) for term in self._before(kind))
 
     def _before(self, kind: type[Term] | None) -> tuple[Term, ...]:
+        """Return the terms before a term; all if the scene does not have it."""
         kinds = [type(term) for term in self.terms]
         return self.terms if kind not in kinds else self.terms[: kinds.index(kind)]
 
@@ -300,10 +300,10 @@ def build_max_lane(config: KernelConfig) -> Callable[..., Any]:
 
     @ti.func
     def max_lane(values):
-        most = values + vector(0)
+        largest = values + vector(0)
         for half in ti.static(halves):
-            most = ti.max(most, vector([most[(lane + half) % lanes] for lane in ti.static(range(lanes))]))
-        return most[0]
+            largest = ti.max(largest, vector([largest[(lane + half) % lanes] for lane in ti.static(range(lanes))]))
+        return largest[0]
 
     return max_lane
 
@@ -337,4 +337,4 @@ class Entry(NamedTuple):
     row: KernelRow
     b: Any  # index of the entry in its row
     u: Any  # displacement, a list of x, y and z; for tangents its change
-    shape: Any = None  # for tangents, the displacement
+    displacement: Any = None  # for tangents only

@@ -25,7 +25,7 @@ class BendingTerm(Term):
     """Bending. Moments are stored in additional rows of u, one row ahead of the row that is stepped."""
 
     has_gradient: ClassVar[bool] = True
-    # The force on a row depends on the moments of the next rows, which depend on the displacements one row further.
+    # The force on a row depends on the moments of both neighbouring rows, and these on displacements one row further.
     reach: ClassVar[int] = 2
     constant_count: ClassVar[int] = 1
     # The sum of the squared Laplacian.
@@ -57,7 +57,7 @@ class BendingTerm(Term):
         return plan.material.bending * float(sums[0])
 
     def build_store_moment(self, config: KernelConfig) -> Callable[..., None]:
-        """Build the Taichi function that stores the moment of an entry."""
+        """Build the Taichi function store_moment(sheet, i, before, row, after, b, target)."""
         ti = config.ti
         vector, constant, laplacian = config.vector, config.first_constant(BendingTerm), build_laplacian(config)
 
@@ -122,7 +122,7 @@ def build_laplacian(config: KernelConfig) -> Callable[..., Any]:
 
     @ti.func
     def laplacian(field: ti.template(), width, before, row, after, b, across, down):
-        """Return the Laplacian at entry b of a row between `before` and `after`; across = 1/dx^2, down = 1/dy^2."""
+        """Return the Laplacian at entry b of a row, with the factors across = 1 / dx^2 and down = 1 / dy^2."""
         centre = field[row * width + b]
         horizontal = (field[row * width + b - 1] - centre) + (field[row * width + b + 1] - centre)
         vertical = (field[before * width + b] - centre) + (field[after * width + b] - centre)

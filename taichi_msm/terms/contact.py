@@ -1,22 +1,24 @@
 """Contact, friction and grips of position-controlled tools. Scene: `probes` with `path`.
 
-After each step, free mass points (neither fixed nor held) are projected out of the shapes of the tools, in the order of
-the probes. With the displacement u after the step, the tip c of a tool, and the depth and normal n of X + u - c in its
-shape (`taichi_msm.shapes`), the correction is
+In dynamic scenes, contact corrects the displacements u of the mass points after each step, one tool after the other in
+the order of `probes`. In the shape of a tool with the tip c, X + u - c has a depth and an outward normal n
+(`taichi_msm.shapes`). Mass points with depth > 0, neither fixed nor held, are projected out of the shape, and the
+friction mu reduces their slip; u' and c' are those before the step:
 
-    where depth > 0:     correction = depth n
-    with friction mu:    w = the part of (u + correction - u_before) - (c - c_before) perpendicular to n
-                         correction -= w min(1, mu depth / |w|)
+    slip = (u + depth n - u') - (c - c'),    w = slip - (slip . n) n
+    correction = depth n - w min(1, mu depth / |w|)
+
+A correction has the effect of the force correction / gain (`model.verlet`), so the corrections yield the force of the
+tool.
 
 A grip holds the mass points within 1.5 radii of the tip's centre at its start: u = u_start + c - c_start. A clamp, a
-tool of radius 0, holds its mass points from the start of the run: u = c. A correction has the effect of a force, the
-correction times m (1 + g h / 2) / h^2 (see `damping`), so the summed corrections yield the force of the tool.
+tool of radius 0 whose c is a displacement, holds its side from the start of the run: u = c.
 
-In quasi-static scenes a tool pushes the mass points that touch it and never pulls. It carries the part of their force F
-into its shape, min(F . n, 0) n; the remainder, tangential or outward, vanishes in equilibrium. The fields of
-corrections store the normals n, and 0 without contact. Held mass points, and those that stick to a rough tool, move
-with their tool, which carries their whole force. Projected Gauss-Seidel iteration finds the forces and corrections of
-several tools on one mass point.
+In quasi-static scenes a tool pushes the mass points that touch it, and never pulls. Of the force F on a mass point it
+carries the part into its shape, min(F . n, 0) n; the remainder, tangential or outward, vanishes in equilibrium. If
+several tools touch a mass point, projected Gauss-Seidel iteration finds their parts and corrections. The fields of
+corrections store n, and 0 without contact. Mass points that are held, or stick to a rough tool, move with their tool,
+which carries all of F.
 """
 
 # No `from __future__ import annotations` here: Taichi reads the annotations of a kernel.
@@ -51,17 +53,18 @@ from taichi_msm.terms.base import (
 
 # Columns of the load table. For all tools: the weight of the step's corrections. For each tool: the tip's centre after
 # and before the step; the state of its grip, and the tool's displacement since the grip began; axis, length, radius and
-# friction; the inverse y and z components of the axis.
+# friction; the reciprocals of y and z of the axis.
 WEIGHT, COLUMNS = 0, 1
 TIP_AFTER, TIP_BEFORE, GRIP_STATE, GRIP_SHIFT, AXIS = 0, 3, 6, 7, 10
 LENGTH, RADIUS, FRICTION, INVERSE_AXIS, TOOL_COLUMNS = 13, 14, 15, 16, 18
 
-# States of a grip in a step.
-GRIP_IDLE, GRIP_BEGINS, GRIP_CONTINUES = 0.0, 1.0, 2.0
+# States of a grip in a step; 0 without one.
+GRIP_BEGINS, GRIP_CONTINUES = 1.0, 2.0
 
-# Fields: for every tool the three components of the summed corrections; with grips, the index of the tool that holds a
-# mass point plus 1, and the displacement of the mass point when the grip began. For mass points that stick to a rough
-# tool (`contact_rest`): the index plus 1 plus the number of tools, and the displacement relative to the tool.
+# Fields: for each tool, the sum of the corrections (3); with grips, the holder of a mass point and a displacement (3):
+#     free                     0
+#     held by tool n           n + 1             displacement when the grip began
+#     stuck to rough tool n    tools + n + 1     displacement relative to the tip (`contact_rest`)
 CORRECTIONS, HOLDER, HOLD_DISPLACEMENT = 3, 0, 1
 
 
@@ -69,9 +72,9 @@ CORRECTIONS, HOLDER, HOLD_DISPLACEMENT = 3, 0, 1
 class ContactTerm(Term):
     """Position-controlled tools."""
 
-    shapes: tuple[str, ...]  # name of the shape of every tool
-    has_friction: tuple[bool, ...]  # whether each tool has friction
-    grips: bool  # whether any tool can hold tissue, as grips, clamps and rough tools do
+    shapes: tuple[str, ...]  # for each tool, the name of its shape
+    has_friction: tuple[bool, ...]  # for each tool, whether it has friction
+    grips: bool  # whether any tool holds mass points, by a grip, as a clamp or as a rough tool
 
     @classmethod
     def from_plan(cls, plan: Plan) -> Self | None:
@@ -86,7 +89,7 @@ class ContactTerm(Term):
         return (*names, "holder", *(f"held {axis}" for axis in "xyz")) if self.grips else names
 
     def has_history(self, plan: Plan) -> bool:
-        """Return whether mass points stick to a tool."""
+        """Return whether any tool is rough."""
         return any(tool.rough for tool in plan.tools)
 
     def fields(self, plan: Plan) -> NDArray[Any]:
@@ -134,8 +137,8 @@ class ContactTerm(Term):
         if all(needed <= available for needed, available in friction) and self.grips <= compiled.grips:
             return ""
         return (
-            "friction and grips cannot be added where there were none; restart with the new scene, such as with a "
-            "friction of 1e-9, at rest rough, or with a grip that ends before the start"
+            "friction and grips cannot be added to a tool later; restart with the new scene, or begin with friction: "
+            "1e-9 (rough in quasi-static scenes) or with a grip that ends before 0 s"
         )
 
     def build_correction(self, config: KernelConfig) -> Correction:
@@ -154,7 +157,7 @@ class ContactTerm(Term):
         ti, real, vector, tools, grips = config.ti, config.real, config.vector, len(self.shapes), self.grips
         max_lane = build_max_lane(config)
         _, grip_field, bases = self._places(config)
-        holding = grip_field + HOLDER
+        holder_field = grip_field + HOLDER
 
         @ti.func
         def cut(low, high, begin, end, start, inverse):
@@ -182,7 +185,7 @@ class ContactTerm(Term):
             if ti.static(grips):
                 held = vector(0)
                 for b in range(1, sheet.width - 1):
-                    held = ti.max(held, sheet.fields[(holding * sheet.rows + i) * sheet.width + b])
+                    held = ti.max(held, sheet.fields[(holder_field * sheet.rows + i) * sheet.width + b])
                 reached = reached or max_lane(held) > 0
             return reached
 
@@ -271,7 +274,7 @@ class ContactTerm(Term):
     def _build_remove(self, config: KernelConfig) -> Callable[..., None]:
         ti, vector, tools, grips = config.ti, config.vector, len(self.shapes), self.grips
         first_field, grip_field, _ = self._places(config)
-        holding, iterations = grip_field + HOLDER, self._iterations
+        holder_field, iterations = grip_field + HOLDER, self._iterations
 
         @ti.func
         def remove(force: ti.template(), sheet: ti.template(), at):
@@ -290,7 +293,7 @@ class ContactTerm(Term):
                         force[c] += change * normal[c]
             if ti.static(grips):
                 for c in ti.static(range(3)):
-                    force[c] = ti.select(sheet.fields[holding * field + at] > 0, vector(0), force[c])
+                    force[c] = ti.select(sheet.fields[holder_field * field + at] > 0, vector(0), force[c])
 
         return remove
 

@@ -1,9 +1,9 @@
-"""Contact in quasi-static equilibrium: tools between two shapes, the beginning and end of grips, and rough tools.
+"""Contact in quasi-static scenes: tools between two equilibria, begin and end of grips, and rough tools.
 
-Scene: `friction: rough`. Between two shapes tools and mass points move along straight lines. A mass point with the
-displacement u' that a rough tool reaches when its tip is at c' sticks to it: with the tip at c, u = u' + c - c'. It is
-held as by a grip until the tool would pull it, that is, until the sum F of all other forces on it points out of the
-tool, F . n > 0.
+Scene: `friction: rough`. Between two equilibria, tools and mass points move along straight lines. A mass point that
+touches a rough tool sticks to it: u = u' + c - c', with its displacement u' and the tip c' at the first touch. The tool
+holds it like a grip, but never pulls it: it releases the mass point when the sum F of all other forces points out of
+the tool, F . n > 0.
 
 The memory of the term (`ContactTerm.memory`) contains the normals of contact and the holders of mass points.
 """
@@ -49,15 +49,15 @@ def touched_points(tools: int, memory: Array) -> NDArray[np.bool_]:
 
 
 def is_gripping(tools: Sequence[Tool], memory: Array) -> bool:
-    """Return whether the tip of any tool holds a mass point.
+    """Return whether any tool but a clamp grips a mass point.
 
     Args:
         tools: the position-controlled tools.
         memory: memory of the term, shape (numbers, rows, cols).
     """
-    touching = [n + 1 for n, tool in enumerate(tools) if not isinstance(tool, Clamp)]
+    grips = [n + 1 for n, tool in enumerate(tools) if not isinstance(tool, Clamp)]
     begin = CORRECTIONS * len(tools) + HOLDER
-    return bool(np.isin(memory[begin : begin + 1], touching).any())
+    return bool(np.isin(memory[begin : begin + 1], grips).any())
 
 
 def set_tools(plan: Plan, frame: int, time: float, columns: Array) -> None:
@@ -112,13 +112,13 @@ def memory_after_grips(plan: Plan, frame: int, displacement: Array, before: Arra
 
 
 def _grip_start(plan: Plan, tool: Tool, frame: int) -> int | None:
-    """Return the first frame of the grip that is active at a frame; None without one."""
+    """Return the first frame of the grip that is active at a frame; None without a grip."""
     frames = (grip_frames(grip, plan.grid.frames_per_second) for grip in tool.grips)
     return next((active.start for active in frames if frame in active), None)
 
 
 def _centre_at_grip(plan: Plan, tool: Tool, frame: int) -> Array:
-    """Return the tip's centre [m] at the frame before a grip begins, whose displacements the grip stores."""
+    """Return the tip's centre [m] one frame before the first frame of a grip, when the grip stores displacements."""
     return tool.tip_centre(np.array([max(0, frame - 1) / plan.grid.frames_per_second]))[0]
 
 
@@ -129,7 +129,7 @@ def stick(plan: Plan, memory: Array, start: Array, end: Array, times: tuple[floa
         plan: plan of the run.
         memory: memory before, shape (numbers, rows, cols).
         start: x - X at the first time [m], shape (rows, cols, 3).
-        end: x - X at the second time without further contact [m], shape (rows, cols, 3).
+        end: x - X at the second time if no tool touched more mass points [m], shape (rows, cols, 3).
         times: times between which the tools move along straight lines [s].
     """
     tools, memory, rest = plan.tools, memory.copy(), rest_positions(plan.scene.sheet)
@@ -138,12 +138,11 @@ def stick(plan: Plan, memory: Array, start: Array, end: Array, times: tuple[floa
     for n, tool in enumerate(tools):
         if tool.rough:
             first, last = tool.tip_centre(np.array(times))
-            share = _first_touch(tool, rest + start - first, end - start - (last - first))
-            touched = free & (share <= 1) & (share < earliest)
-            earliest[touched] = share[touched]
-            by = share[touched, None]
+            fraction = _first_touch(tool, rest + start - first, end - start - (last - first))
+            touched = free & (fraction <= 1) & (fraction < earliest)
+            earliest[touched] = fraction[touched]
             fields[HOLDER, touched] = len(tools) + n + 1
-            shift = by * (end[touched] - start[touched] - (last - first))
+            shift = fraction[touched, None] * (end[touched] - start[touched] - (last - first))
             fields[HOLD_DISPLACEMENT:, touched] = (start[touched] - first + shift).T
     return memory
 
@@ -213,7 +212,7 @@ def release(plan: Plan, memory: Array, pulls: Array) -> Array:
 
 
 def _first_touch(tool: Tool, r: Array, motion: Array) -> Array:
-    """Return the first share of a motion relative to a tool, from r, at which points touch it; infinite if not."""
+    """Return the fraction of a motion from r, relative to a tool, until each point touches it; else infinity."""
     distance = np.linalg.norm(motion, axis=-1)
     direction = motion / np.maximum(distance, np.finfo(float).tiny)[..., None]
     products = direction @ tool.axis, r @ tool.axis, (r * direction).sum(axis=-1), (r * r).sum(axis=-1)

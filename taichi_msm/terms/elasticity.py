@@ -47,7 +47,7 @@ class SpringFamily(NamedTuple):
         return Elongation(q, edges, (q * (edges + self.offset)).sum(axis=-1), (edges**2).sum(axis=-1))
 
     def tangent(self, displacement: Array) -> Array:
-        """Compute the derivative of each spring's force by the position of an end [N/m], shape (..., 3, 3)."""
+        """Differentiate each spring's force with respect to the position of an end [N/m], shape (..., 3, 3)."""
         _, edges, square_difference, square = self.elongation(displacement)
         isotropic, axial, *_ = self.derivatives(square_difference, square, 1.0)
         along = axial[..., None, None] * edges[..., :, None] * edges[..., None, :]
@@ -72,9 +72,9 @@ class SpringFamily(NamedTuple):
             square_difference: L^2 - L0^2 [m2], shape (...).
             square: L^2 [m2], shape (...).
         """
-        arguments = self.stiffness, self.tension, square_difference, square, self.length
-        by_lock, by_factor = self.law.parameter_derivatives(*arguments, *self.parameters)
-        return by_lock, by_factor
+        return self.law.parameter_derivatives(
+            self.stiffness, self.tension, square_difference, square, self.length, *self.parameters
+        )
 
     def energy(self, displacement: Array) -> Array:
         """Compute the energy of each spring above that at rest [J], shape (...).
@@ -83,8 +83,8 @@ class SpringFamily(NamedTuple):
         equilibrium at rest.
         """
         q, _, square_difference, _ = self.elongation(displacement)
-        share = square_difference / self.length**2
-        stretched = self.law.energy(self.stiffness, self.tension, share, *self.parameters)
+        square_strain = square_difference / self.length**2
+        stretched = self.law.energy(self.stiffness, self.tension, square_strain, *self.parameters)
         return (stretched * self.length**2 + self.tension * (q**2).sum(axis=-1)) / 2
 
 

@@ -38,13 +38,13 @@ class FoundationTerm(Term):
 
     @staticmethod
     def derive(scene: Scene) -> dict[str, Any]:
-        """Derive K [N/m], 0 if the foundation is never active, and whether it is always active."""
+        """Derive K [N/m], 0 if the foundation is never active; whether it is always active; and its law."""
         stiffening = None
         if scene.tissue is not None:
             k = scene.tissue.foundation_stiffness * math.prod(spacing(scene.sheet))
-            active, keys = scene.tissue.foundation_active, scene.tissue.foundation
-            if isinstance(keys, Foundation):
-                stiffening = make_stiffening(keys.lock, keys.factor)
+            active, foundation = scene.tissue.foundation_active, scene.tissue.foundation
+            if isinstance(foundation, Foundation):
+                stiffening = make_stiffening(foundation.lock, foundation.factor)
         else:
             assert scene.springs is not None
             k, active = scene.springs.virtual, scene.springs.virtual_active
@@ -98,28 +98,28 @@ class FoundationTerm(Term):
         return (self._build_add(config, tangent=True),)
 
     def _build_add(self, config: KernelConfig, *, tangent: bool) -> Callable[..., Any]:
-        ti, locks, column, share = config.ti, self.locks, config.first_column(FoundationTerm), self.build_share(config)
-        ratio = self._build_law(config)[tangent]
+        ti, locks, column = config.ti, self.locks, config.first_column(FoundationTerm)
+        stiffness_at, (secant, slope) = self.build_stiffness(config), self._build_law(config)
+        ratio = slope if tangent else secant
 
         @ti.func
         def add(force: ti.template(), sheet: ti.template(), entry: ti.template(), now: ti.template()):
-            k, shape = share(sheet, entry, now[column]), ti.static(entry.shape if tangent else entry.u)
+            k, u = stiffness_at(sheet, entry, now[column]), ti.static(entry.displacement if tangent else entry.u)
             for c in ti.static(range(3)):
                 if ti.static(locks and c == 2):
-                    force[c] = force[c] - k * (entry.u[c] * ratio(sheet, shape[2]))
+                    force[c] = force[c] - k * (entry.u[c] * ratio(sheet, u[2]))
                 else:
                     force[c] = force[c] - k * entry.u[c]
 
         return add
 
     def build_derivatives(self, config: KernelConfig) -> Callable[..., Any]:
-        """Build the Taichi function derive(sheet, p, u) for derivatives of minus the product of p with the force.
+        """Build the Taichi function derive(sheet, p, u), which differentiates -p . force.
 
-        Returns:
-            A function that returns the derivatives with respect to K, and for K = 1 to log(lock) and the factor.
+        It returns the derivatives with respect to K, log(lock) and the factor, the latter two divided by K.
         """
-        ti, locks, first, law = config.ti, self.locks, config.first_constant(FoundationTerm), self._build_law(config)
-        secant, tangent = law
+        ti, locks, first = config.ti, self.locks, config.first_constant(FoundationTerm)
+        secant, tangent = self._build_law(config)
 
         @ti.func
         def derive(sheet: ti.template(), p: ti.template(), u: ti.template()):
@@ -135,12 +135,12 @@ class FoundationTerm(Term):
 
         return derive
 
-    def build_share(self, config: KernelConfig) -> Callable[..., Any]:
-        """Build the Taichi function share(sheet, entry, k), the stiffness at an entry."""
+    def build_stiffness(self, config: KernelConfig) -> Callable[..., Any]:
+        """Build the Taichi function stiffness_at(sheet, entry, k), where k is the stiffness of a whole cell."""
         ti, mapped, by_area, field = config.ti, self.mapped, self.by_area, config.first_field(FoundationTerm)
 
         @ti.func
-        def share(sheet: ti.template(), entry: ti.template(), k):
+        def stiffness_at(sheet: ti.template(), entry: ti.template(), k):
             if ti.static(mapped):
                 return k * sheet.fields[(field * sheet.rows + entry.row.i) * sheet.width + entry.b]
             elif ti.static(by_area):  # noqa: RET505  # Taichi would compile the rest as well.
@@ -148,7 +148,7 @@ class FoundationTerm(Term):
             else:
                 return k
 
-        return share
+        return stiffness_at
 
     def _build_law(self, config: KernelConfig) -> tuple[Callable[..., Any], Callable[..., Any]]:
         """Build the Taichi functions secant(sheet, u_z) and tangent(sheet, u_z) of a foundation that locks."""

@@ -47,9 +47,9 @@ class LawFunctions(NamedTuple):
 
     Attributes:
         pull: pull(k, tau, square_difference, square, length, *parameters), the force divided by L, without tau q [N/m].
-        derivatives: derivatives(k, tau, square_difference, square, length, along, *parameters) returns s, w, and the
-            derivatives of `pull` with respect to k and tau. A change p of q, with along = (o + q) . p, changes the
-            force by s p + w (o + q), without tau p.
+        derivatives: derivatives(k, tau, square_difference, square, length, along, *parameters), which returns s, w, and
+            the derivatives of `pull` with respect to k and tau. If q changes by p, with along = (o + q) . p, the force
+            changes by s p + w (o + q) + tau p.
         parameter_derivatives: parameter_derivatives(k, tau, square_difference, square, length, *parameters), the
             derivatives of `pull` with respect to the logarithm of the lock and to the factor.
         energy: energy(k, tau, square_strain, *parameters) with square_strain = (L^2 - L0^2) / L0^2, twice the energy
@@ -73,7 +73,7 @@ class Law(ABC):
 
         Args:
             operations: operations of NumPy or Taichi.
-            tense: whether the springs have a tension at rest; if not, tau is 0 and `pull` ignores it.
+            tense: whether the springs are under tension at rest; if not, `pull` ignores tau.
         """
 
 

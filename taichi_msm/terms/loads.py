@@ -1,8 +1,8 @@
 """Loads: the forces of force-controlled probes on the mass points around their control points. Scene: `probes`.
 
 The force on a mass point at the distance d is F exp(-max(falloff d + shift, offset)), see `probe_force`. The load
-table contains its parameters for every step and `ProbeSlot`. The decay factors of a stationary control point, the
-exponentials, are stored in a field.
+table contains F and the other parameters for every step and `ProbeSlot`. A slot with a stationary control point has a
+field with the decay factors, the exponentials.
 """
 
 # No `from __future__ import annotations` here: Taichi reads the annotations of a kernel.
@@ -33,8 +33,8 @@ class ProbeTerm(Term):
 
     has_gradient: ClassVar[bool] = True
 
-    moves: tuple[bool, ...]  # whether the control point moves, for each slot
-    by_area: tuple[bool, ...]  # whether forces are smaller at an open edge, for each slot
+    moves: tuple[bool, ...]  # for each slot, whether its control point moves
+    by_area: tuple[bool, ...]  # for each slot, whether its forces are smaller at an open edge
 
     @classmethod
     def from_plan(cls, plan: Plan) -> Self:
@@ -75,30 +75,30 @@ class ProbeTerm(Term):
         def add(force: ti.template(), sheet: ti.template(), entry: ti.template(), now: ti.template()):
             for n in ti.static(range(len(moves))):
                 column = ti.static(first + SLOT_COLUMNS * n)
-                share = vector(0)
+                factor = vector(0)
                 if ti.static(moves[n]):
                     off_x = sheet.by_column[REST_X * sheet.width + entry.b] - now[column + POINT]
                     off_y = sheet.constants[TOP_Y] - entry.row.i * sheet.constants[DY] - now[column + POINT + 1]
                     exponent = now[column + FALLOFF] * ti.sqrt(off_x * off_x + off_y * off_y) + now[column + SHIFT]
                     exponent = ti.max(exponent, now[column + OFFSET])
-                    share = vector([ti.exp(-exponent[lane]) for lane in ti.static(range(lanes))])
+                    factor = vector([ti.exp(-exponent[lane]) for lane in ti.static(range(lanes))])
                     if ti.static(by_area[n]):
-                        share *= sheet.by_column[(AREA_SHARE + entry.row.kind) * sheet.width + entry.b]
+                        factor *= sheet.by_column[(AREA_SHARE + entry.row.kind) * sheet.width + entry.b]
                 else:
-                    share = sheet.fields[(stationary[n] * sheet.rows + entry.row.i) * sheet.width + entry.b]
+                    factor = sheet.fields[(stationary[n] * sheet.rows + entry.row.i) * sheet.width + entry.b]
                 for c in ti.static(range(3)):
-                    force[c] += now[column + c] * share
+                    force[c] += now[column + c] * factor
 
         return (add,)
 
     def supports(self, compiled: Self) -> str:
         if self.moves != compiled.moves:
             return (
-                f"which control points move or jump cannot change (before: {_format_flags(compiled.moves)}; now: "
-                f"{_format_flags(self.moves)}); restart with the new scene"
+                "a control point cannot change between fixed and moving (moving before: "
+                f"{_format_flags(compiled.moves)}; now: {_format_flags(self.moves)}); restart with the new scene"
             )
         if self.by_area != compiled.by_area:
-            return "a probe has total instead of force, or the reverse; restart with the new scene"
+            return "a probe cannot change between total and force; restart with the new scene"
         return ""
 
     def decay_gradients(self, plan: Plan) -> NDArray[Any]:
@@ -115,9 +115,8 @@ class ProbeTerm(Term):
             first_gradient: index of the first field of `decay_gradients` among the fields in `sheet.derivatives`.
 
         Returns:
-            The Taichi function add_adjoint(sums, sheet, entry, now). It differentiates the product of the force of each
-            slot and `entry.u` with respect to the force (3) and the control point (2), and adds the derivatives to the
-            list `sums`.
+            The Taichi function add_adjoint(sums, sheet, entry, now). It differentiates force . `entry.u` of each slot
+            with respect to the force (3) and the control point (2), and adds the derivatives to the list `sums`.
         """
         ti = config.ti
         moves, by_area, first = self.moves, self.by_area, config.first_column(ProbeTerm)
@@ -129,28 +128,28 @@ class ProbeTerm(Term):
             i, b = entry.row.i, entry.b
             for n in ti.static(range(len(moves))):
                 column = ti.static(first + SLOT_COLUMNS * n)
-                share, gradient = vector(0), [vector(0), vector(0)]
+                factor, gradient = vector(0), [vector(0), vector(0)]
                 if ti.static(moves[n]):
                     off_x = sheet.by_column[REST_X * sheet.width + b] - now[column + POINT]
                     off_y = sheet.constants[TOP_Y] - i * sheet.constants[DY] - now[column + POINT + 1]
                     distance = ti.sqrt(off_x * off_x + off_y * off_y)
                     exponent = now[column + FALLOFF] * distance + now[column + SHIFT]
                     # The derivative is 0 where the force does not depend on the distance, and at the control point.
-                    falloff_by_distance = now[column + FALLOFF] / ti.select(distance > 0, distance, vector(1))
-                    falloff_by_distance = ti.select(exponent > now[column + OFFSET], falloff_by_distance, vector(0))
+                    slope = now[column + FALLOFF] / ti.select(distance > 0, distance, vector(1))
+                    slope = ti.select(exponent > now[column + OFFSET], slope, vector(0))
                     exponent = ti.max(exponent, now[column + OFFSET])
-                    share = vector([ti.exp(-exponent[lane]) for lane in ti.static(range(lanes))])
+                    factor = vector([ti.exp(-exponent[lane]) for lane in ti.static(range(lanes))])
                     if ti.static(by_area[n]):
-                        share *= sheet.by_column[(AREA_SHARE + entry.row.kind) * sheet.width + b]
-                    gradient[0], gradient[1] = share * falloff_by_distance * off_x, share * falloff_by_distance * off_y
+                        factor *= sheet.by_column[(AREA_SHARE + entry.row.kind) * sheet.width + b]
+                    gradient[0], gradient[1] = factor * slope * off_x, factor * slope * off_y
                 else:
-                    share = sheet.fields[((first_field + stationary[n]) * sheet.rows + i) * sheet.width + b]
+                    factor = sheet.fields[((first_field + stationary[n]) * sheet.rows + i) * sheet.width + b]
                     for axis in ti.static(range(2)):
                         row = (first_gradient + 2 * stationary[n] + axis) * sheet.rows + i
                         gradient[axis] = sheet.derivatives[row * sheet.width + b]
                 work = vector(0)
                 for c in ti.static(range(3)):
-                    sums[5 * n + c] += share * entry.u[c]
+                    sums[5 * n + c] += factor * entry.u[c]
                     work += now[column + c] * entry.u[c]
                 for axis in ti.static(range(2)):
                     sums[5 * n + 3 + axis] += work * gradient[axis]
@@ -159,13 +158,13 @@ class ProbeTerm(Term):
 
 
 def decay_parameters(plan: Plan) -> list[tuple[object, ...]]:
-    """Return the parameters of the decay factors of the stationary slots, to detect changes."""
+    """Return control point and force law, without the force, of the stationary slots, to detect other decay factors."""
     probes = [plan.scene.probes[slot.probe] for slot in plan.slots if not slot.moves]
     return [(probe.at, probe_force(probe, plan.scene.sheet)[1:]) for probe in probes]
 
 
 def max_free_acceleration(plan: Plan) -> float:
-    """Bound the acceleration of a free mass point by all probes [m/s^2]."""
+    """Return an upper bound of the acceleration of a free mass point, the sum over all probes [m/s2]."""
     forces = (
         probe_force(probe, plan.scene.sheet).max_force * max(abs(percent) for _, percent in probe.load) / 100
         for probe in plan.scene.probes
@@ -174,11 +173,11 @@ def max_free_acceleration(plan: Plan) -> float:
     return sum(forces) / plan.material.mass
 
 
-def force_norm(slot: ProbeSlot, scene: Scene) -> float:
-    """Return a bound of the Euclidean norm of the decay factors of all mass points.
+def decay_norm_bound(slot: ProbeSlot, scene: Scene) -> float:
+    """Return an upper bound of the Euclidean norm of a slot's decay factors, over all mass points.
 
     Args:
-        slot: slot of a probe, whose control point may move.
+        slot: slot of a probe; its control point may move.
         scene: scene of the slot.
     """
     if not slot.moves:
@@ -190,5 +189,5 @@ def force_norm(slot: ProbeSlot, scene: Scene) -> float:
     return 2 * float(np.linalg.norm(probe_force(scene.probes[slot.probe], scene.sheet).decay(nearest)))
 
 
-def _format_flags(moves: tuple[bool, ...]) -> str:
-    return ", ".join("yes" if slot_moves else "no" for slot_moves in moves) or "none"
+def _format_flags(flags: tuple[bool, ...]) -> str:
+    return ", ".join("yes" if flag else "no" for flag in flags) or "none"

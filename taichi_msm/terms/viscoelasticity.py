@@ -7,7 +7,7 @@ x_i, the force
     (1 - G) f_n + sum of (s_i + share_i phi_i f_n)
 
 acts in place of f_n. The memory s_i, initially 0, then becomes exp(-x_i) s_i - share_i phi_i (1 - exp(-x_i)) f_n. This
-is exact for forces that are linear in time between the steps.
+is exact for forces that are linear in time between steps.
 
 In quasi-static scenes h is the time between frames, and the memory s_i changes at frames only. In frame 0 the full f
 acts, and then s_i = share_i (exp(-x_i) - phi_i) f.
@@ -28,8 +28,8 @@ from taichi_msm.model.plan import Plan
 from taichi_msm.scene.scene import Scene
 from taichi_msm.terms.base import KernelConfig, Term
 
-# Columns of the load table: the factor of f; in quasi-static scenes, whether the memory changes; for each branch,
-# g = 1 - exp(-x) and c = share phi: s decreases by g (s + c f). In f32, exp(-x) would lose the digits of a small x.
+# Columns of the load table: the factor of f; in quasi-static scenes 1 if the memory changes, else 0; for each branch
+# g = 1 - exp(-x) and c = share phi, with which s decreases by g (s + c f). exp(-x) in f32 would lose digits of small x.
 FACTOR, UPDATE, BRANCHES, BRANCH_COLUMNS = 0, 1, 2, 2
 
 
@@ -39,7 +39,7 @@ class ViscoelasticTerm(Term):
 
     key: ClassVar[str] = "tissue.relaxation"
 
-    branches: int  # count
+    branches: int  # number of branches
     at_rest: bool  # whether the memory changes only at frames, as marked in the load table
 
     @staticmethod
@@ -87,14 +87,14 @@ class ViscoelasticTerm(Term):
                 elastic = force[c]
                 force[c] = elastic * now[first + FACTOR]
                 for n in ti.static(range(branches)):
-                    place = (first_field + 3 * n + c) * sheet.rows * sheet.width + at
+                    index = (first_field + 3 * n + c) * sheet.rows * sheet.width + at
                     column = ti.static(first + BRANCHES + BRANCH_COLUMNS * n)
-                    s = sheet.fields[place]
+                    s = sheet.fields[index]
                     force[c] += s
                     if ti.static(at_rest):
                         if now[first + UPDATE] > 0:
-                            sheet.fields[place] = s - now[column] * (s + now[column + 1] * elastic)
+                            sheet.fields[index] = s - now[column] * (s + now[column + 1] * elastic)
                     else:
-                        sheet.fields[place] = s - now[column] * (s + now[column + 1] * elastic)
+                        sheet.fields[index] = s - now[column] * (s + now[column + 1] * elastic)
 
         return (relax,)

@@ -1,6 +1,6 @@
-"""Input events of a session, in pixels from the upper left corner of the picture, x to the right and y down.
+"""Input events of a session, with positions in pixels: x right, y down, (0, 0) at the centre of the upper left pixel.
 
-The messages of a page are JSON lists of the name of an event and its values, such as `["press", 256, 250, false]`.
+A page sends an event as a JSON list of its name and its values, such as `["press", 256, 250, false]`.
 """
 
 from __future__ import annotations
@@ -12,23 +12,23 @@ from pydantic import ConfigDict, TypeAdapter, ValidationError
 
 from taichi_msm.view.material import MATERIAL
 
-# Largest message of a page [bytes], and largest absolute value in it.
+# Limits of a message of a page: its size [bytes], and the absolute value of its numbers.
 MAX_BYTES = 512
 MAX_VALUE = 1e12
 
-# Message of a page that has read a picture.
+# Message with which a page acknowledges a picture.
 SHOWN = ["shown"]
 
 
 class Hover(NamedTuple):
-    """The pointer moves to a pixel, without a pressed button."""
+    """The pointer moves to a pixel, no button pressed."""
 
     x: float
     y: float
 
 
 class Press(NamedTuple):
-    """The tool presses at a pixel; with `pull` it pulls, or grips if it is position-controlled."""
+    """The tool presses at a pixel; with `pull`, it pulls if force-controlled and grips if position-controlled."""
 
     x: float
     y: float
@@ -47,14 +47,14 @@ class Release(NamedTuple):
 
 
 class Turn(NamedTuple):
-    """The camera orbits, as if the near side of the tissue were dragged by this distance [px]."""
+    """The camera orbits as if the near side of the tissue were dragged by this distance [px]."""
 
     right: float
     down: float
 
 
 class Strength(NamedTuple):
-    """The strength is set [% of the full force or depth]; negative values lift a grip."""
+    """The strength is set [% of the full force or depth]; below 0, gripped tissue is lifted."""
 
     percent: float
 
@@ -72,7 +72,7 @@ class Key(NamedTuple):
 
 
 class Material(NamedTuple):
-    """A key of `material.MATERIAL` gets another value; the tissue keeps its shape."""
+    """A key of `MATERIAL` gets another value; the tissue keeps its shape and motion."""
 
     key: str
     value: float
@@ -86,21 +86,21 @@ QUIT = Key("q")
 SWITCH_TOOL = Key("f")
 COMPILING = "one moment: compiling"
 
-# Increment of the strength per notch of the wheel or press of a key [% of the full force or depth].
+# Increment of the strength per wheel notch or keystroke [% of the full force or depth].
 STRENGTH_STEP = 5.0
 
 # Pointer actions and their help texts.
 POINTER = {
-    "left button": "press; dragged, the tool moves",
-    "shift + left button": "the opposite force, such as pull; by position: grip",
+    "left button": "press; drag to move the tool",
+    "shift + left button": "pull, the opposite force; by position: grip",
     "wheel": f"press harder or deeper, by {STRENGTH_STEP:g} %; lift the gripped tissue",
-    "right button": "dragged, turn the picture",
+    "right button": "drag to turn the picture",
 }
 
 # Keys and their help texts.
 KEYS = {
-    "up": f"press harder or deeper, by {STRENGTH_STEP:g} %; so does +",
-    "down": f"press less, by {STRENGTH_STEP:g} %; so does -",
+    "up": f"press harder or deeper, by {STRENGTH_STEP:g} %; also +",
+    "down": f"press less, by {STRENGTH_STEP:g} %; also -",
     "f": "reset, and hold the tool by position or by force",
     "c": "the scene's own camera",
     "t": "look from the top",
@@ -108,13 +108,13 @@ KEYS = {
     "m": "mesh on and off",
     "l": "light on and off",
     "space": "pause and go on",
-    ".": "while paused: one frame further",
-    "r": "reset: put the tissue at rest, forget the session so far",
+    ".": "while paused: advance by a frame",
+    "r": "reset: put the tissue at rest, discard the session so far",
     "p": "save the tissue as PNG",
     "g": "start and stop a film (GIF)",
-    "w": "save the session as a scene, which run repeats",
-    "i": "the figures on and off",
-    "h": "the keys on and off",
+    "w": "save the session as a scene; run repeats it",
+    "i": "readings on and off",
+    "h": "list of keys on and off",
     "q": "quit",
 }
 
@@ -141,11 +141,10 @@ def parse_message(message: str | bytes) -> Event | None:
         return None
     if not (isinstance(values, list) and values and isinstance(values[0], str) and values[0] in _EVENTS):
         raise ValueError(f"not a list of an event and its values; the events are {', '.join(_EVENTS)}")
-    kind = _EVENTS[values[0]]
     if any(isinstance(value, (int, float)) and not abs(value) <= MAX_VALUE for value in values):
         raise ValueError(f"{values[0]}: a value is not from {-MAX_VALUE:g} to {MAX_VALUE:g}")
     try:
-        event = kind.validate_python(tuple(values[1:]))
+        event = _EVENTS[values[0]].validate_python(tuple(values[1:]))
     except ValidationError as error:
         first = error.errors(include_url=False, include_input=False)[0]
         raise ValueError(f"{values[0]}: {first['msg']}") from None

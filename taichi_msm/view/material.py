@@ -8,7 +8,7 @@ from typing import Any
 from taichi_msm.scene.scene import Scene
 from taichi_msm.scene.section import Section
 
-# Name and unit of each key; a session can change the values above 0.
+# Name and unit of each key whose value a session can change, where it is above 0.
 MATERIAL = {
     "tissue.young": ("Young's modulus", "Pa"),
     "tissue.foundation": ("foundation", "N/m³"),
@@ -20,12 +20,12 @@ MATERIAL = {
     "damping": ("damping", "N s/m"),
 }
 
-# A value changes by at most this factor, up or down, from that of the scene.
+# Largest ratio between a changed value and the scene's, in either direction.
 MAX_FACTOR = 10.0
 
 
 def material_values(scene: Scene) -> dict[str, float]:
-    """Return the values above 0 of the material of a scene, by key."""
+    """Return the values of a scene that a session can change, by key of `MATERIAL`."""
     values = {}
     for key in MATERIAL:
         try:
@@ -41,10 +41,10 @@ def with_value(section: Any, key: str, value: float) -> Any:
     """Return a copy of a scene or a section with another value.
 
     Args:
-        section: the scene, or a section of it; not validated again.
-        key: dotted path of a number below it.
-        value: the number, in the unit of its key.
+        section: a scene or one of its sections; the copy is not validated.
+        key: dotted path of a number, relative to the section.
+        value: the number, in the unit of the key.
     """
     name, _, rest = key.partition(".")
-    below: Section | float = with_value(getattr(section, name), rest, value) if rest else value
-    return section.model_copy(update={name: below})
+    changed: Section | float = with_value(getattr(section, name), rest, value) if rest else value
+    return section.model_copy(update={name: changed})

@@ -1,4 +1,4 @@
-"""Overlay of a session's picture: figures, help texts, and a mark at the tool."""
+"""Overlay of a session's picture: readings, help texts, and a ring around the tool."""
 
 from __future__ import annotations
 
@@ -21,15 +21,15 @@ OUTLINE_GREY = 140
 
 
 class ValueBar(NamedTuple):
-    """A value as a bar, scaled to the largest value so far, rounded up."""
+    """Bar of a value; the full bar is the largest value so far, rounded up."""
 
     value: float  # [unit]
-    largest: float  # positive
+    largest: float  # largest value so far, above 0 [unit]
     unit: str
 
     @property
     def end(self) -> float:
-        """The value at the end of the bar: 1, 2 or 5 times a power of ten."""
+        """Value of a full bar: 1, 2 or 5 times a power of ten [unit]."""
         power = 10.0 ** math.floor(math.log10(self.largest))
         return next(digit * power for digit in (1, 2, 5, 10) if self.largest <= digit * power * (1 + 1e-9))
 
@@ -46,9 +46,9 @@ def write_text(
     Args:
         picture: shape (height, width, 3).
         above: lines in the upper left corner, above the bar and the two columns of the table.
-        below: text at the bottom, which is wrapped.
-        table: names and their meanings, such as keys and their effects.
-        bar: value that is shown as a bar.
+        below: text at the bottom, wrapped to the width.
+        table: text of two columns, such as keys and their effects; None for no table.
+        bar: bar between the lines and the table; None for no bar.
     """
     height, width = picture.shape[:2]
     # Height of letters [px].
@@ -72,7 +72,7 @@ def mark_tool(picture: Picture, pixel: tuple[float, float], *, pulls: bool) -> N
     Args:
         picture: shape (height, width, 3).
         pixel: centre (x, y) of the ring [px]; may be outside of the picture.
-        pulls: whether the ring has the colour of pulling.
+        pulls: whether the ring is yellow, for a pulling tool, instead of white.
     """
     radius = picture.shape[0] * (1 / 50)
     reach = int(radius) + 4
@@ -104,7 +104,7 @@ def _panel(size: int, *lines: str) -> NDArray[np.uint8]:
 
 @lru_cache(maxsize=64)
 def _columns(rows: tuple[tuple[str, str], ...], size: int) -> NDArray[np.uint8]:
-    """Draw two columns of text, shape (height, width); empty without rows."""
+    """Draw rows of two columns of text in grey, shape (height, width); (0, 0) without rows."""
     if not rows:
         return np.zeros((0, 0), np.uint8)
     font, line, edge = ImageFont.load_default(size), round(1.4 * size), size // 2
@@ -120,7 +120,7 @@ def _columns(rows: tuple[tuple[str, str], ...], size: int) -> NDArray[np.uint8]:
 
 @lru_cache(maxsize=64)
 def _bar(size: int, filled: int, end: str) -> NDArray[np.uint8]:
-    """Draw a bar that is filled to a length [px], with the label of its end; shape (height, width)."""
+    """Draw a bar, filled to a length [px], and the label `end` to its right in grey, shape (height, width)."""
     edge, height, width = size // 2, round(0.6 * size), BAR_LENGTH_LETTERS * size
     label = _panel(size, end)
     panel = np.zeros((len(label), edge + width + label.shape[1]), np.uint8)

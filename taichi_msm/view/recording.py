@@ -1,4 +1,4 @@
-"""Files saved by a session: pictures, films and scenes, each written atomically under a free name."""
+"""Files of a session: pictures, films and scenes, each written atomically."""
 
 from __future__ import annotations
 
@@ -24,17 +24,17 @@ from taichi_msm.scene.scene import Scene
 
 
 class Film:
-    """A film of a session, encoded in a hidden folder while the session runs; `close` removes the folder.
+    """Film of a running session, encoded in a hidden folder; `close` removes the folder.
 
-    The constructor and the methods raise a FilesError when the film cannot be written.
+    All methods raise a FilesError when the film cannot be written.
 
     Args:
-        path: the film, .gif or .mp4; the hidden folder is in its folder.
-        option: name of the option in messages.
-        render: settings with the size and background of the pictures.
+        path: path of the film, .gif or .mp4; the hidden folder is next to it.
+        option: command-line option of the path, for messages.
+        render: size, background and quality of the pictures.
         rate: frames of the session per second.
-        subframes: frames of the session per picture.
-        begin: first frame of the session.
+        subframes: frames of the session per picture of the film.
+        begin: frame of the session at which the film begins.
     """
 
     def __init__(self, path: Path, option: str, render: Render, rate: float, subframes: int, begin: int) -> None:
@@ -43,16 +43,15 @@ class Film:
         self._subframes, self._begin, self._location = subframes, begin, (path.parent, option)
         with writing(*self._location), ExitStack() as opened:
             self._hidden = opened.enter_context(hidden_folder(path.parent))
-            formats = (self._format,)
             job = EncodingJob(
-                (self._hidden,), render.size, rate / subframes, formats, render.background, render.quality
+                (self._hidden,), render.size, rate / subframes, (self._format,), render.background, render.quality
             )
             self._encoder = Encoder(job)
             opened.callback(self._encoder.abort)
             self._opened = opened.pop_all()
 
     def add_frame(self, picture: Picture, frame: int) -> None:
-        """Append a picture, repeated in place of missing earlier ones.
+        """Append a picture, repeated for the pictures skipped since the last call.
 
         Args:
             picture: shape (height, width, 3).
@@ -64,7 +63,7 @@ class Film:
                 self.pictures += 1
 
     def finish(self) -> Path:
-        """Finish a film with at least one picture; return its file, which the caller must move."""
+        """Finish a film with at least one picture; return its path in the hidden folder, for the caller to move."""
         with writing(*self._location):
             self._encoder.finish()
         return self._hidden / OUTPUTS[self._format].path()
@@ -75,13 +74,16 @@ class Film:
 
 
 class Captures:
-    """Directory of the files saved by a session, created with the first file.
+    """Folder for the files of a session, created with the first file.
 
-    The methods raise a FilesError when the directory cannot be written. `saved` has the paths of the files, in order.
+    The methods raise a FilesError when the folder cannot be written.
 
     Args:
-        folder: path of the directory.
-        name: name of the scene, for comments.
+        folder: path of the folder.
+        name: name of the scene, for a comment in saved scenes.
+
+    Attributes:
+        saved: paths of the saved files, in order.
     """
 
     def __init__(self, folder: Path, name: str) -> None:
@@ -105,9 +107,9 @@ class Captures:
             dumper: Any = getattr(yaml, "CSafeDumper", yaml.SafeDumper)
             text = yaml.dump(data, Dumper=dumper, allow_unicode=True, **style)
             text = f"# Recorded in a live session of {printable(self._name)}; `run` repeats it.\n{text}"
-            # Without the keyframes of its probes, a scene has at most 1000 values.
+            # Besides the keyframes of its probes, a scene has at most 1000 values.
             if len(text.encode()) > MAX_BYTES or count_probe_values(scene) + 1000 > MAX_NODES:
-                raise FilesError("this session is too long for a scene file; reset it, and do less")
+                raise FilesError("this session is too long for a scene file; reset it (r), and record a shorter one")
             (hidden / "session").write_text(text, "utf-8")
             return self._move_to_free_name(hidden / "session", "session", ".yaml")
 
@@ -116,10 +118,10 @@ class Captures:
 
         Args:
             film: a film with at least one picture.
-            path: path of the file, replaced if it exists; None for a free name in the folder.
+            path: destination, replaced if it exists; None for a free name in the folder.
 
         Returns:
-            The path of the saved file.
+            The path of the saved film.
         """
         with closing(film), writing(path or self.folder):
             if path is None:
@@ -132,7 +134,7 @@ class Captures:
         return self.saved[-1]
 
     def _copy_picture(self, image: Path) -> Path:
-        """Copy a picture under its name, or a numbered one, unless an equal copy exists."""
+        """Copy a picture to the folder unless an equal copy is there; return its path."""
         copy, number = self.folder / image.name, 1
         if not image.is_file():
             raise FilesError(f"{image}: missing; put the picture back, the scene needs a copy of it")

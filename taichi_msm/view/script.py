@@ -1,4 +1,4 @@
-"""Scripts of input events, read from YAML files, and films of sessions without a page."""
+"""Scripts of input events in YAML, and films of sessions that they drive without a page."""
 
 from __future__ import annotations
 
@@ -38,17 +38,17 @@ SCRIPT_KEYS = tuple(name for name in KEYS if name != "q")
 class ScriptEvent(Section):
     """An event of a script."""
 
-    t: Seconds = key(..., description="when, or when it begins [s]", expects=SECONDS)
+    t: Seconds = key(..., description="time of the event, or of its beginning [s]", expects=SECONDS)
     do: Literal["press", "pull", "drag", "release", "turn", "percent", "key"] = key(
         ..., description="action", expects="press, pull, drag, release, turn, percent or key"
     )
     at: Pair | None = key(
-        None, description="the pixel", expects="for press, pull and drag [x, y] in pixels from the top left"
+        None, description="pixel of the event", expects="for press, pull and drag [x, y] in pixels from the top left"
     )
     by: Pair | None = key(None, description="turn of the picture", expects="for turn [right, down] in pixels")
     to: Annotated[Number, Field(ge=-100, le=100)] | None = key(
         None,
-        description="percent of the full force, or of the greatest depth",
+        description="strength [% of the full force or depth]",
         expects="for percent a number from -100 to 100",
     )
     name: str | None = key(None, description="a key of the page", expects="for key the name of one")
@@ -70,13 +70,11 @@ class ScriptEvent(Section):
 
 
 class Script(Section):
-    """Content of a script file."""
+    """Content of a script."""
 
     size: tuple[Pixels, Pixels] | None = key(
         None,
-        description=(
-            "width, height of the picture that the pixels are of [px]; others are scaled; default: the session's"
-        ),
+        description="size of the picture to which pixels refer, width and height [px]; default: the session's",
         expects=f"two whole numbers, 1 to {MAX_PIXELS}: [width, height] in pixels",
     )
     events: tuple[ScriptEvent, ...] = key(
@@ -91,7 +89,7 @@ class Script(Section):
             if entry.do in ("drag", "release") and not presses:
                 raise _refused(n, "{do} when nothing is pressed; put a press or a pull before it", do=entry.do)
             if entry.t < end:
-                message = "begins at {t} s, before the one above ends at {end} s; let them follow each other"
+                message = "begins at {t} s, before the previous event ends at {end} s; take a later t"
                 raise _refused(n, message, t=f"{entry.t:g}", end=f"{end:g}")
             presses, end = entry.do in ("press", "pull") or (presses and entry.do != "release"), entry.t + entry.seconds
         return events
@@ -109,7 +107,7 @@ def load_script(path: str | Path, size: tuple[int, int]) -> Script:
         size: width and height of the session's picture [px].
 
     Returns:
-        The script; all its pixels are in the picture.
+        The script; all presses are in the picture.
 
     Raises:
         SceneError: with a line for each error of the file, in the order of the file.
@@ -137,12 +135,12 @@ def schedule_events(script: Script, rate: float, size: tuple[int, int]) -> Itera
     """Convert a script to events of a session.
 
     Args:
-        script: the script.
+        script: a checked script.
         rate: frames per second of the session.
         size: width and height of the session's picture [px].
 
-    Returns:
-        Pairs of a frame and the event before it, in order.
+    Yields:
+        Frame number, and an event to handle before this frame is drawn; in order of frames.
     """
     scale = [actual / assumed for actual, assumed in zip(size, script.size or size, strict=True)]
     x = y = 0.0
@@ -178,18 +176,18 @@ def record_film(
     progress: Callable[[int, int], None] = lambda done, total: None,
     notify: Callable[[str], None] = lambda notice: None,
 ) -> None:
-    """Run a session without a page and record a film; its end replaces an earlier file.
+    """Run a session without a page, and film it; the finished film replaces an existing file.
 
     Args:
         session: a new session.
         path: the film, .gif or .mp4.
         seconds: duration of the film [s].
-        events: as returned by `schedule_events`; consumed lazily.
-        progress: called often with the finished and total frames; an exception from it stops the session.
-        notify: called with notices for the user.
+        events: pairs of a frame number and an event, from `schedule_events`; consumed lazily.
+        progress: called for every frame with the finished and the total number; an exception from it stops the session.
+        notify: called with every notice of the session.
 
     Raises:
-        FilesError: when the film cannot be written; or, after it was written, when an event could not save its file.
+        FilesError: when the film cannot be written; after the film is written, when an event could not save a file.
     """
     frames = round(seconds * session.frame_rate)
     events = iter(events)

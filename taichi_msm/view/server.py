@@ -1,7 +1,7 @@
 """A session in browsers: a server sends pictures and readings, and receives events, on the loopback interface only.
 
-The server is Tornado's, one wheel without dependencies (docs/decisions/0032). It shares a thread with the session, as
-Taichi holds Python's lock while a kernel runs.
+Server and session share a thread, because Taichi holds Python's global lock while a kernel runs. Decision 0032 explains
+the choice of Tornado.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ from taichi_msm.view.tools import PositionControlledTool
 
 ADDRESS = "127.0.0.1"
 
-# File name and media type of each file of the page, by its path below the token.
+# File name and media type by the path of a request after the token.
 PAGE = {
     "": ("index.html", "text/html"),
     "style.css": ("style.css", "text/css"),
@@ -52,21 +52,21 @@ HEADERS = {
     "X-Content-Type-Options": "nosniff",
 }
 
-# Largest number of unread pictures of a page; limits the lag of a slow connection.
+# Largest number of unacknowledged pictures of a page, which limits the lag of a slow connection.
 MAX_UNREAD_PICTURES = 3
 
 MAX_PAGES = 16
 
-# Largest number of events within a frame, from the page that steers.
+# Largest number of events that wait for the next frame.
 MAX_EVENTS = 500
 
 # Shortest wait for events between two pictures [s].
 MIN_WAIT_S = 0.001
 
-# Largest delay of the simulation that is caught up [s].
+# Longest delay behind real time that the session catches up [s].
 MAX_DELAY_S = 0.1
 
-# Time limit of the steps between two pictures, even with frames due [s].
+# Longest time of stepping between two pictures, even if more frames are due [s].
 MAX_STEPPING_S = 0.03
 
 
@@ -77,7 +77,7 @@ def listen(port: int) -> socket.socket:
         port: number of the port, or 0 for a free one.
 
     Returns:
-        The listening socket, which does not block.
+        A listening, non-blocking socket.
 
     Raises:
         DeviceError: when the port cannot be used.
@@ -92,13 +92,13 @@ def listen(port: int) -> socket.socket:
 
 
 class Server:
-    """Server of a session to pages in browsers. The page that has been open longest steers, the others watch.
+    """Server of a session to pages in browsers. The page that has been open longest steers; the others watch.
 
     Args:
         session: a new session.
         listener: listening socket, from `listen`.
         title: title of the page.
-        origins: permitted origins of pages behind a proxy, in addition to those of the loopback interface.
+        origins: permitted origins of pages behind a proxy; origins of the loopback interface are always permitted.
 
     Attributes:
         url: address of the page, with the token.
@@ -112,7 +112,7 @@ class Server:
         self.pages: list[_Connection] = []
         self._events: deque[events.Event] = deque()
         self._handled = 0
-        # The last picture, as it was drawn and as it was sent.
+        # Last picture, as drawn and as JPEG.
         self._picture: Picture | None = None
         self._jpeg = b""
 
@@ -142,14 +142,14 @@ class Server:
             await http.close_all_connections()
 
     def permits(self, request: HTTPServerRequest) -> bool:
-        """Return whether a request has the token, and either no origin or a permitted one."""
+        """Return whether a request has the token, and no origin or a permitted one."""
         token = request.path.lstrip("/").partition("/")[0]
         origin = request.headers.get("Origin")
-        known = origin is None or origin in self._origins or self._is_own(origin, request.host)
-        return hmac.compare_digest(token.encode("utf-8", "replace"), self._token.encode()) and known
+        is_permitted = origin is None or origin in self._origins or self._is_own(origin, request.host)
+        return hmac.compare_digest(token.encode("utf-8", "replace"), self._token.encode()) and is_permitted
 
     def _is_own(self, origin: str, host: str) -> bool:
-        """Return whether an origin is that of this server, or of a port that `ssh -L` forwards to the server."""
+        """Return whether an origin is this server, or a loopback port that `ssh -L` forwards to it."""
         try:
             parts, forwarded = urlsplit(origin), urlsplit(f"//{host}").port
             is_plain = f"{parts.scheme}://{parts.netloc}" == origin and parts.scheme == "http"
@@ -160,7 +160,7 @@ class Server:
             return False
 
     def connect(self, page: _Connection) -> None:
-        """Add a page, and describe the session to it."""
+        """Add a page, and send it a description of the session."""
         session = self._session
         material = [
             {"key": key, "name": MATERIAL[key][0], "unit": MATERIAL[key][1], "initial": initial}
@@ -178,17 +178,17 @@ class Server:
         page.send(json.dumps(description))
 
     def disconnect(self, page: _Connection) -> None:
-        """Remove a page; if it steered, the tool is released, and the next page steers."""
+        """Remove a page; if it steered, release the tool and let the next page steer."""
         if page is self.pages[0]:
             self._events.append(events.Release())
         self.pages.remove(page)
 
     def receive(self, page: _Connection, message: str | bytes) -> None:
-        """Queue the event of a message, or reply with the error of an invalid message.
+        """Queue the event of a message; reply to an invalid one with its error.
 
         Args:
-            page: the sender; events are ignored unless it steers.
-            message: see `events.parse_message`.
+            page: the sender; its events are ignored unless it steers.
+            message: text for `events.parse_message`.
         """
         try:
             event = events.parse_message(message)
@@ -230,7 +230,7 @@ class Server:
             self._show(pacing.status())
 
     def _advance(self) -> None:
-        """Advance the session by a frame, and keep its readings for every page."""
+        """Advance the session by a frame, and queue its readings for every page."""
         session, before = self._session, self._session.frame
         session.advance()
         if session.frame != before:
@@ -240,7 +240,7 @@ class Server:
                 page.readings.append(reading)
 
     def _show(self, pacing: str) -> None:
-        """Send the state, and a changed picture, to the pages with fewer unread pictures than the limit."""
+        """Send the state, and the picture if it changed, to every page below the limit of unread pictures."""
         ready = [page for page in self.pages if page.unread < MAX_UNREAD_PICTURES]
         if not (ready or self._session.filming):
             return
@@ -249,8 +249,8 @@ class Server:
             self._picture, self._jpeg = picture, encode_jpeg(picture)
         state = self._state(pacing)
         for page in ready:
-            of_page = {"steers": page is self.pages[0], "readings": list(page.readings)}
-            header = json.dumps({**state, **of_page}, allow_nan=False).encode()
+            page_state = {"steers": page is self.pages[0], "readings": list(page.readings)}
+            header = json.dumps({**state, **page_state}, allow_nan=False).encode()
             jpeg = b"" if page.jpeg is self._jpeg else self._jpeg
             page.send(len(header).to_bytes(4, "big") + header + jpeg)
             page.jpeg = self._jpeg
@@ -275,14 +275,14 @@ class Server:
         }
 
     async def _announce(self, notice: str) -> None:
-        """Show a notice on all pages before a longer pause."""
+        """Show a notice on all pages before the session blocks."""
         for page in self.pages:
             page.send(json.dumps({"notice": notice}))
         await asyncio.sleep(MIN_WAIT_S)
 
 
 class Pacing:
-    """Scheduler that synchronises simulated with real time.
+    """Schedule of frames in real time.
 
     Args:
         rate: frames per second of the session.
@@ -293,7 +293,7 @@ class Pacing:
         self._rate = rate
         self._clock = clock
         self._next = clock()
-        # Start [s] and number of simulated frames of each recent picture.
+        # Start [s] of each recent picture, and number of frames simulated for it.
         self._pictures: deque[tuple[float, int]] = deque()
 
     def delay_s(self) -> float:
@@ -301,7 +301,7 @@ class Pacing:
         return max(0.0, self._next - self._clock())
 
     def due_frames(self) -> Iterator[int]:
-        """Yield the numbers of the due frames; after the first one, for at most `MAX_STEPPING_S`."""
+        """Yield the due frames, numbered from 0: the first one, and others within `MAX_STEPPING_S`."""
         start = self._clock()
         self._next = max(self._next, start - MAX_DELAY_S)
         count = 0
@@ -310,12 +310,12 @@ class Pacing:
             yield count
             count += 1
         self._pictures.append((start, count))
-        # The speed is averaged over 1 s.
+        # Rate and speed are averages over 1 s.
         while start - self._pictures[0][0] > 1.0:
             self._pictures.popleft()
 
     def status(self) -> str:
-        """Format the pictures per second, and a speed below 95 % of real time."""
+        """Format the rate of pictures, and the speed if it is below 95 % of real time."""
         if len(self._pictures) < 2:
             return ""
         seconds = self._pictures[-1][0] - self._pictures[0][0]
@@ -334,7 +334,7 @@ def encode_jpeg(picture: Picture) -> bytes:
 
 
 class _Guarded(RequestHandler):
-    """A handler of requests that the server permits."""
+    """Handler that rejects requests without permission."""
 
     def initialize(self, server: Server) -> None:
         self.server = server
@@ -349,7 +349,7 @@ class _Guarded(RequestHandler):
 
 
 class _Page(_Guarded):
-    """The files of the page."""
+    """Handler of the page's files."""
 
     def get(self) -> None:
         token, slash, name = self.request.path.lstrip("/").partition("/")
@@ -364,11 +364,11 @@ class _Page(_Guarded):
 
 
 class _Connection(_Guarded, WebSocketHandler):
-    """The connection of a page.
+    """Connection of a page.
 
     Attributes:
-        unread: number of pictures that the page has not read yet.
-        readings: time [s], force [N] and depth [m] of the frames since the last picture.
+        unread: number of sent pictures that the page has not acknowledged.
+        readings: time [s], force [N] and depth [m] of each frame since the last picture.
         jpeg: last picture sent to the page.
     """
 
@@ -395,7 +395,7 @@ class _Connection(_Guarded, WebSocketHandler):
         return True
 
     def send(self, message: str | bytes) -> None:
-        """Send a message, unless the page has left."""
+        """Send a message; ignore a page that has left."""
         try:
             sent = self.write_message(message, binary=isinstance(message, bytes))
         except WebSocketClosedError:

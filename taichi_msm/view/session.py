@@ -35,19 +35,19 @@ from taichi_msm.view.recording import Captures, Film, count_probe_values
 from taichi_msm.view.tools import ForceControlledTool, PositionControlledTool, SheetPosition, clear_start
 from taichi_msm.view.viewport import Viewport
 
-# Largest frame rate of a session, that of common screens [1/s].
+# Largest frame rate of a session, that of a common screen [1/s].
 MAX_FRAME_RATE = 60.0
 
 NOTICE_DURATION_S = 3.0
 
 
 def divide_frames(plan: Plan) -> tuple[Plan, int]:
-    """Divide the frames of a scene into equal subframes, at most `MAX_FRAME_RATE` per second.
+    """Divide every frame of a plan into the largest number of subframes within `MAX_FRAME_RATE`.
 
-    `precision: auto` without a tolerance becomes f32, which takes half the time.
+    `precision: auto` without a tolerance becomes f32, which takes half the time of f64.
 
     Returns:
-        The plan with subframes as frames, and the number of subframes per frame of the scene.
+        The plan with subframes as its frames, and the number of subframes per frame.
     """
     scene = plan.scene
     subframes = max(1, int(MAX_FRAME_RATE / scene.time.frames_per_second * (1 + 1e-9)))
@@ -64,25 +64,28 @@ def divide_frames(plan: Plan) -> tuple[Plan, int]:
 class Session:
     """Interactive simulation of a scene with a tool; a context manager that saves a running film on exit.
 
-    The force-controlled tool has the force, falloff and offset of the first probe with a force; the position-controlled
-    tool the instrument and friction of the first probe with a path, or of the first one with an instrument. The first
-    probe except clamps determines the initial tool. Clamps always hold the sheet.
+    There are up to two tools. The force-controlled one has the force, falloff and offset of the first probe with a
+    force. The position-controlled one has the instrument and friction of the first probe with a path, otherwise of the
+    first probe with an instrument. The first probe that is not a clamp decides which one is used first. Clamps always
+    hold the sheet.
 
     Args:
-        scene: the scene; the attribute of this name has the frames and the time step of the session.
+        scene: scene that is simulated.
         captures: receives saved files.
         arch: cpu, cuda or vulkan.
         threads: number of CPU threads, by default one per core.
-        play: whether the scene's own probes act too.
-        progress: called often with the stage; an exception from it stops the session.
+        play: whether the scene's own probes act in addition to the tool.
+        progress: called often with the stage; an exception from it stops the construction.
 
     Raises:
         SceneError: when the scene has no picture, no probe, or too many probes.
         DeviceError: when the arch is not available.
 
     Attributes:
-        subframes: frames of the session per frame of the given scene.
-        divergence_error: message of a divergence, which stops the simulation; otherwise empty.
+        scene: the scene with the frames and the time step of the session.
+        tool: current tool.
+        subframes: frames of the session per frame of the scene that was given.
+        divergence_error: message of the divergence that stopped the simulation; empty without one.
     """
 
     def __init__(
@@ -106,7 +109,7 @@ class Session:
         self._film: Film | None = None
         self._film_path: Path | None = None
         self._scene_probes = tuple(probe for probe in scene.probes if play or probe.clamp is not None)
-        # No outputs: their kernels need no compilation.
+        # Without outputs, whose kernels would be compiled.
         self._plan = replace(plan, scene=scene.model_copy(update={"output": ()}))
         self._force_tool = _force_tool(plan, self._scene_probes)
         self._position_tool = _position_tool(plan, self._scene_probes)
@@ -116,7 +119,7 @@ class Session:
         self.tool = tool
         plan = self._with_tool(tool)
         self.scene = scene.model_copy(update={"probes": plan.scene.probes})
-        self._show_figures, self._show_keys = True, False
+        self._show_readings, self._show_keys = True, False
         self._single_step = self._has_warned_of_length = self._material_changed = self.paused = False
         # Elapsed frames, including those of pauses.
         self._elapsed = 0
@@ -127,7 +130,7 @@ class Session:
         # Largest force since the last reset [N].
         self._max_felt_force = 0.0
         progress("compile")
-        # Workers spin while they wait for each other; one core is left for the browser.
+        # One core is left for the browser: workers spin while they wait for each other.
         self._simulation = Simulation(plan, arch, threads, texture, max(1, available_threads() - 1))
         self._simulation.compile(lambda: progress("compile"))
         self._scene_material = material_values(scene)
@@ -140,12 +143,12 @@ class Session:
 
     @property
     def frame_rate(self) -> float:
-        """The frames per second of the session."""
+        """Frames per second of the session."""
         return self.scene.time.frames_per_second
 
     @property
     def frame(self) -> int:
-        """The number of frames simulated since the last reset."""
+        """Number of frames simulated since the last reset."""
         return self._simulation.frame
 
     def positions(self) -> NDArray[np.floating]:
@@ -157,7 +160,7 @@ class Session:
         return float(np.linalg.norm(self._touched_point() - [*self._rest_point(self.tool.position), 0.0]))
 
     def depth(self) -> float:
-        """Return the depth of the tissue at the tool below the sheet at rest [m]; negative above it."""
+        """Return the depth of the tissue at the tool, below the sheet at rest [m]; negative above it."""
         return -float(self._touched_point()[2])
 
     def tool_force(self) -> float:
@@ -165,11 +168,11 @@ class Session:
         return float(np.linalg.norm(self._simulation.forces()[-1].force))
 
     def felt_force(self) -> float:
-        """Return the mean force on a position-controlled tool in the last frame [N]; 0 for other tools."""
+        """Return the force on a position-controlled tool in the last frame [N]; 0 for the force-controlled one."""
         return 0.0 if isinstance(self.tool, ForceControlledTool) else self.tool_force()
 
     def material(self) -> dict[str, tuple[float, float]]:
-        """Return the current and the initial value of each key that an event `Material` can change."""
+        """Return the current and the initial value by key that an event `Material` can change."""
         current = material_values(self.scene)
         return {key: (current[key], initial) for key, initial in self._scene_material.items()}
 
@@ -215,12 +218,12 @@ class Session:
                 self._change_material(key, value)
 
     def advance(self) -> None:
-        """Advance by a frame, without motion while paused."""
+        """Advance by a frame; simulate it unless the session is paused or has diverged."""
         self._elapsed += 1
         if (self.paused and not self._single_step) or self.divergence_error:
             return
         self._single_step = False
-        # Warn at three quarters of the limit of a scene file.
+        # The warning comes at three quarters of the limit of a scene file.
         if self.frame % 200 == 0 and not self._has_warned_of_length:
             self._has_warned_of_length = count_probe_values(self.recorded_scene()) > 0.75 * MAX_NODES
             if self._has_warned_of_length:
@@ -245,35 +248,38 @@ class Session:
         return self._film is not None
 
     def start_film(self, path: Path | None = None) -> None:
-        """Start a film; its end saves it to a path, or under a free name in the folder of captures.
+        """Start a film, which is saved when it ends.
+
+        Args:
+            path: destination; None for a free name in the folder of captures.
 
         Raises:
-            FilesError: when it cannot be written.
+            FilesError: when the film cannot be written.
         """
         file, option = (self._captures.folder / "film.gif", "--out") if path is None else (path, "--record")
         self._film = Film(file, option, self.scene.render, self.frame_rate, self.subframes, self._elapsed)
         self._film_path = path
         if path is not None:
-            # A session that ends at once has a film, too.
+            # So a session that ends at once has a film.
             self._film.add_frame(self._draw(), self._elapsed)
 
     def picture(self) -> Picture:
-        """Draw the tissue and the overlay, shape (height, width, 3); add the picture without text to a running film."""
+        """Draw a picture with the overlay, shape (height, width, 3); a running film gets it without text."""
         picture = self.bare_picture()
-        above = self._figure_lines() if self._show_figures else ["paused"] if self.paused else []
+        above = self._reading_lines() if self._show_readings else ["paused"] if self.paused else []
         keys, bar = (events.POINTER | events.KEYS if self._show_keys else None), None
         # A small picture has no space for both.
-        if self._show_figures and self._max_felt_force > 0 and keys is None:
+        if self._show_readings and self._max_felt_force > 0 and keys is None:
             bar = overlay.ValueBar(self.felt_force(), self._max_felt_force, "N")
         overlay.write_text(picture, above, self.notice, keys, bar)
         return picture
 
     def bare_picture(self) -> Picture:
-        """Draw the tissue, and a mark at a tool without an instrument; add the picture to a running film."""
+        """Draw a picture with a ring at a tool without an instrument; a running film gets it, too."""
         picture = self._draw()
         tool = self.tool
-        hidden = isinstance(tool, PositionControlledTool) or tool.percent == 0 or tool.probe.instrument is not None
-        if not hidden and (pixel := self.viewport.project(self._touched_point())):
+        has_ring = isinstance(tool, ForceControlledTool) and tool.percent != 0 and tool.probe.instrument is None
+        if has_ring and (pixel := self.viewport.project(self._touched_point())):
             overlay.mark_tool(picture, pixel, pulls=self._pulls)
         if self._film is not None:
             try:
@@ -290,7 +296,7 @@ class Session:
 
     @property
     def notice(self) -> str:
-        """The current notice."""
+        """Current notice; without one, the message of a divergence, or empty."""
         return self._notice if self._elapsed < self._notice_until else self.divergence_error
 
     def close(self) -> None:
@@ -305,7 +311,7 @@ class Session:
         self.close()
 
     def _draw(self) -> Picture:
-        """Draw the tissue and the instruments; that of an idle tool is at the pointer."""
+        """Draw the tissue and the instruments; an idle force-controlled tool is drawn at the pointer."""
         positions, scene = self.positions(), self._simulation.scene
         instruments = place_instruments(scene, positions, self._simulation.time)
         instrument = scene.probes[-1].instrument
@@ -323,10 +329,10 @@ class Session:
         return surface_point(self.positions(), self.scene.render.refine, self.scene.sheet, rest)[0]
 
     def _press(self, x: float, y: float, direction: int) -> None:
-        """Press (direction 1), or pull or grip (-1), the tissue at a pixel.
+        """Press the tissue at a pixel; with direction -1 instead of 1, pull or grip it.
 
-        A force-controlled tool acts on the visible material. A position-controlled tool acts at the point of the rest
-        plane.
+        A force-controlled tool acts at the material point that is visible there, a position-controlled one at the point
+        of the rest plane.
         """
         position = self._simulation.pick((x, y), self.viewport.view)
         if position is None:
@@ -342,7 +348,7 @@ class Session:
     def _drag(self, x: float, y: float) -> None:
         """Move the pressing tool by the displacement of the pointer on the rest plane.
 
-        The deformed sheet would cause feedback, as it moves with the tool.
+        On the deformed sheet, which moves with the tool, there would be feedback.
         """
         if self._drag_start is None:
             return
@@ -362,7 +368,7 @@ class Session:
         self._drag_start = self._hover_pixel = None
 
     def _hover_position(self) -> SheetPosition | None:
-        """Return the position under the pointer for an idle force-controlled tool; None for all others."""
+        """Return the position under the pointer, for an idle force-controlled tool; None for other tools."""
         if isinstance(self.tool, PositionControlledTool) or self.tool.engaged or self.tool.percent != 0:
             return None
         return None if self._hover_pixel is None else self._simulation.pick(self._hover_pixel, self.viewport.view)
@@ -396,7 +402,7 @@ class Session:
                 self._forget_pointer()
                 self._simulation.restart(self._with_tool(self.tool))
                 self.viewport.set_time(0.0)
-                self._reset_figures()
+                self._reset_status()
             case "f":
                 self._switch()
             case "p":
@@ -411,12 +417,12 @@ class Session:
             case "w":
                 self.show_notice(f"saved {self._captures.save_scene(self.recorded_scene())}")
             case "i":
-                self._show_figures = not self._show_figures
+                self._show_readings = not self._show_readings
             case "h":
                 self._show_keys = not self._show_keys
 
     def _with_tool(self, tool: ForceControlledTool | PositionControlledTool) -> Plan:
-        """Plan the scene with a tool at rest; raise a SceneError if it cannot be position-controlled."""
+        """Plan the scene with an idle tool; raise a SceneError if the tool cannot be position-controlled."""
         plan = self._plan.with_probes((*self._scene_probes, tool.recorded_probe(0)))
         session_tools = [tool for tool in plan.tools if tool.probe == len(self._scene_probes)]
         if any(path_problems(plan.scene, session_tools, plan.grid)):
@@ -426,10 +432,11 @@ class Session:
         return plan
 
     def _switch(self) -> None:
-        tool = self._position_tool if isinstance(self.tool, ForceControlledTool) else self._force_tool
+        by_force = isinstance(self.tool, ForceControlledTool)
+        tool = self._position_tool if by_force else self._force_tool
         if tool is None:
-            needs = "an instrument" if isinstance(self.tool, ForceControlledTool) else "a force"
-            self.show_notice(f"this control of the tool needs {needs}; add it to a probe of the scene")
+            needs = "position needs an instrument" if by_force else "force needs a force"
+            self.show_notice(f"control by {needs}; add it to a probe of the scene")
             return
         try:
             plan = self._with_tool(tool)
@@ -442,7 +449,7 @@ class Session:
         self._simulation.compile()
         self.tool = tool
         self._frame_time_s = 0.0
-        self._reset_figures()
+        self._reset_status()
         session_tools = [tool for tool in plan.tools if tool.probe == len(self._scene_probes)]
         self.show_notice("; ".join(path_warnings(plan.scene, session_tools)))
 
@@ -467,7 +474,7 @@ class Session:
         if self._position_tool is not None:
             self._position_tool.grid = plan.grid
 
-    def _reset_figures(self) -> None:
+    def _reset_status(self) -> None:
         self._single_step = self._has_warned_of_length = self._material_changed = False
         self._max_felt_force, self.divergence_error = 0.0, ""
 
@@ -490,22 +497,25 @@ class Session:
             and tool.percent * probe_force(tool.probe, self.scene.sheet).force[2] > 0
         )
 
-    def _figure_lines(self) -> list[str]:
+    def _reading_lines(self) -> list[str]:
         speed = f"steps {1 / self.frame_rate / self._frame_time_s:.2g} x real time" if self._frame_time_s > 0 else ""
         state = [speed, "paused" if self.paused else "", "film" if self.filming else ""]
-        return ["  ·  ".join(filter(None, line)) for line in (self._tool_figures(), state)]
+        return ["  ·  ".join(filter(None, line)) for line in (self._tool_readings(), state)]
 
-    def _tool_figures(self) -> list[str]:
+    def _tool_readings(self) -> list[str]:
         tool = self.tool
         if isinstance(tool, PositionControlledTool):
             height = tool.height if tool.engaged else -tool.depth
             action = "grip" if tool.gripping else "press" if tool.engaged else "next press"
-            return [f"{action} {length(abs(height))} {'up' if height > 0 else 'deep'}", newtons(self.felt_force())]
+            return [
+                f"{action} {format_length(abs(height))} {'up' if height > 0 else 'deep'}",
+                format_force(self.felt_force()),
+            ]
         action = "pull" if self._pulls else "push"
         percent = f"{action} {abs(tool.percent):.0f} %" if tool.percent else f"tool {tool.strength:.0f} %"
         displacement = self.displacement()
         # Smaller displacements are rounding errors of f32.
-        return [percent, length(displacement if displacement > 1e-6 * max(self.scene.sheet.size) else 0.0)]
+        return [percent, format_length(displacement if displacement > 1e-6 * max(self.scene.sheet.size) else 0.0)]
 
 
 def _require_usable(scene: Scene, *, play: bool) -> None:
@@ -521,27 +531,27 @@ def _require_usable(scene: Scene, *, play: bool) -> None:
         raise SceneError([message for message, applies in errors.items() if applies])
 
 
-def _force_tool(plan: Plan, played: Sequence[Probe]) -> ForceControlledTool | None:
+def _force_tool(plan: Plan, scene_probes: Sequence[Probe]) -> ForceControlledTool | None:
     """Build the force-controlled tool; None if no probe has a force."""
     probe = next((probe for probe in plan.scene.probes if not probe.moved), None)
     if probe is None:
         return None
-    return ForceControlledTool(probe, plan.grid.frames_per_second, clear_start(probe, played, plan.scene))
+    return ForceControlledTool(probe, plan.grid.frames_per_second, clear_start(probe, scene_probes, plan.scene))
 
 
-def _position_tool(plan: Plan, played: Sequence[Probe]) -> PositionControlledTool | None:
+def _position_tool(plan: Plan, scene_probes: Sequence[Probe]) -> PositionControlledTool | None:
     """Build the position-controlled tool; None if no probe has an instrument."""
     probes = sorted(plan.scene.probes, key=lambda probe: not probe.moved)
     probe = next((probe for probe in probes if probe.instrument is not None), None)
-    return None if probe is None else PositionControlledTool(probe, plan, clear_start(probe, played, plan.scene))
+    return None if probe is None else PositionControlledTool(probe, plan, clear_start(probe, scene_probes, plan.scene))
 
 
-def newtons(force: float) -> str:
+def format_force(force: float) -> str:
     """Format a force [N] with at least two digits."""
     return f"{force:.2g} N" if force < 10 else f"{force:.0f} N"
 
 
-def length(metres: float) -> str:
+def format_length(metres: float) -> str:
     """Format a length [m] with three digits in um, mm or m."""
     if 0 < metres < 0.9995e-5:
         return f"{1e6 * metres:.3g} um"

@@ -1,4 +1,4 @@
-"""Tools of a live session, force-controlled or position-controlled, which record keyframes to repeat the session."""
+"""Tools of a live session, force-controlled or position-controlled; their keyframes repeat the session as a scene."""
 
 from __future__ import annotations
 
@@ -19,10 +19,10 @@ from taichi_msm.scene.sheet import Sheet
 from taichi_msm.scene.tools import Probe
 from taichi_msm.shapes import SHAPES
 
-# Rise time from no force to the full force, and travel time from the highest to the deepest position [s].
+# Time in which the force rises from 0 to full, or the tip moves from its highest to its deepest position [s].
 RISE_TIME_S = 0.2
 
-# Number of latest keyframes that determine the next frame, including a jump at its beginning.
+# Number of last keyframes that determine a frame, even with a jump at its beginning.
 ACTIVE_KEYFRAMES = 4
 
 # Height of an idle tip above the sheet at rest [tip radii].
@@ -36,20 +36,20 @@ CENTRE = 0.5, 0.5
 STARTS: tuple[SheetPosition, ...] = (CENTRE, *product((0.1, 0.9), (0.1, 0.9)), *product((0.0, 1.0), (0.0, 1.0)))
 
 
-def clear_start(probe: Probe, played: Sequence[Probe], scene: Scene) -> SheetPosition:
-    """Return a start at which an idle tool intersects no other tool of the session.
+def clear_start(probe: Probe, scene_probes: Sequence[Probe], scene: Scene) -> SheetPosition:
+    """Return the first of `STARTS` at which an idle tool intersects no other tool of the session.
 
     Args:
         probe: probe of the tool.
-        played: probes of the other tools.
+        scene_probes: probes of the other tools.
         scene: scene with the sheet and the duration of the motion.
 
     Returns:
-        The first such position of `STARTS`; the centre if there is none, or for a tool without an instrument.
+        The position; the centre if every one intersects, or for a tool without an instrument.
     """
     if probe.instrument is None:
         return CENTRE
-    others = [_capsule(each, scene.sheet) for each in played if each.instrument is not None]
+    others = [_capsule(each, scene.sheet) for each in scene_probes if each.instrument is not None]
     for start in STARTS:
         hovering = Probe(path=((0.0, *start, _hover_height(probe)),), instrument=probe.instrument)
         if all(overlap((_capsule(hovering, scene.sheet), each), scene.time.duration) is None for each in others):
@@ -58,7 +58,7 @@ def clear_start(probe: Probe, played: Sequence[Probe], scene: Scene) -> SheetPos
 
 
 def _capsule(probe: Probe, sheet: Sheet) -> Tool:
-    """Build a capsule that moves like the instrument of a probe; force-controlled ones stay on the sheet at rest."""
+    """Build a capsule with the motion of a probe's instrument; a force-controlled one stays on the sheet at rest."""
     assert probe.instrument is not None
     capsule = probe.instrument.model_copy(update={"radius": probe.instrument.outer_radius, "plate": None})
     (tool,) = build_tools([Probe(path=probe.path or ((0.0, *CENTRE, 0.0),), instrument=capsule)], sheet)
@@ -71,10 +71,10 @@ def _capsule(probe: Probe, sheet: Sheet) -> Tool:
 
 def _hover_height(probe: Probe) -> float:
     assert probe.instrument is not None
-    return _rounded(HOVER_HEIGHT_RADII * probe.instrument.outer_radius)
+    return _round_height(HOVER_HEIGHT_RADII * probe.instrument.outer_radius)
 
 
-def _rounded(height: float) -> float:
+def _round_height(height: float) -> float:
     """Round a height to the nine significant digits of a scene file."""
     return float(f"{height:.9g}")
 
@@ -82,8 +82,8 @@ def _rounded(height: float) -> float:
 class ForceControlledTool:
     """A tool that presses at one control point at a time, with the force, falloff and offset of a probe.
 
-    Actions take effect at the next frame, at most one press or release per frame: the force is 0 for at least one frame
-    before the tool acts at another position. The force rises within `RISE_TIME_S`, and drops to 0 at a release.
+    A frame applies at most one press or release, and the others wait: the force is 0 for at least a frame before the
+    tool acts at another position. It rises within `RISE_TIME_S`, and drops to 0 at a release.
 
     Args:
         probe: probe with the force, falloff and offset.
@@ -155,7 +155,7 @@ class ForceControlledTool:
         self._pending.append(None)
 
     def advance(self, frame: int) -> Probe:
-        """Apply the pending action in the frame interval that begins at `frame`; return its probe for `steer`."""
+        """Apply the next pending action from a frame on; return the probe of the interval for `Simulation.steer`."""
         begin, end = frame / self._frame_rate, (frame + 1) / self._frame_rate
         if self._pending:
             if (press := self._pending.popleft()) is None:
@@ -188,7 +188,7 @@ class ForceControlledTool:
     def _as_probe(
         self, load: Sequence[tuple[float, float]], at: Sequence[tuple[float, float, float]], end: float
     ) -> Probe:
-        """Build a probe with at least two control points, as the kernel is compiled for moving ones."""
+        """Build a probe with at least two control points, as the kernel is compiled for a moving one."""
         if len(at) == 1:
             at = [*at, (max(end, 1 / self._frame_rate), *at[0][1:])]
         return self.probe.model_copy(update={"load": tuple(load), "at": tuple(at)})
@@ -213,18 +213,18 @@ MAX_DEPTH_RADII = 5.0
 # Coefficient of Coulomb friction of probes without one.
 DEFAULT_FRICTION = 0.5
 
-# Grip before the start [s]; has no effect, but the kernel is compiled with grips.
+# Interval of a grip before the start [s], which has no effect; with it, the kernel is compiled with grips.
 NO_GRIP = (-2.0, -1.0)
 
 
 class PositionControlledTool:
-    """A tool whose tip follows the pointer, above the sheet or at a given depth while it presses.
+    """A tool whose tip follows the pointer: at a given depth during a press, otherwise above the sheet.
 
-    The tip moves in straight lines between frames: up and down within `RISE_TIME_S`, and per step at most by the stride
-    of a run. A grip begins when the tip reaches its depth, and ends with the release.
+    Between frames the tip moves in a straight line, up and down within `RISE_TIME_S`, and by at most the stride of its
+    shape per step. A grip begins when the tip reaches its depth, and ends with the release.
 
     Args:
-        probe: probe with the instrument, and optionally the friction; in quasi-static sessions rough or none.
+        probe: probe with the instrument and the friction; a friction other than rough is 0 in quasi-static sessions.
         plan: plan of the session.
         start: position before the pointer moves.
 
@@ -233,7 +233,7 @@ class PositionControlledTool:
         position: current position of the tip, fractions (across, down) of the sheet.
         target: goal of the tip, fractions (across, down) of the sheet.
         height: current height of the lowest point of the tip above the sheet at rest [m].
-        grid: time grid of the session; a changed material changes its step.
+        grid: time grid of the session, to be replaced when a changed material changes the step.
     """
 
     def __init__(self, probe: Probe, plan: Plan, start: SheetPosition = CENTRE) -> None:
@@ -246,7 +246,7 @@ class PositionControlledTool:
         if plan.scene.time.at_rest and friction != "rough":
             friction = 0.0
         self._probe = Probe(path=((0.0, *start, self._hover_height),), friction=friction, instrument=probe.instrument)
-        # The default depth is the radius of the tip.
+        # The initial depth is the radius of the tip.
         self.strength = min(100.0, 100 * self._radius / self._max_depth)
         self._press_strength = self.strength
         self.reset()
@@ -303,7 +303,7 @@ class PositionControlledTool:
         self.engaged = self._grip_requested = False
 
     def advance(self, frame: int) -> Probe:
-        """Move the tip in the frame interval that begins at `frame`; return the probe for `Simulation.steer`."""
+        """Move the tip from a frame on; return the probe of the interval for `Simulation.steer`."""
         begin, end = self._time(frame), self._time(frame + 1)
         if self._grip_start is not None and not self._grip_requested:
             self._grips.append((self._grip_start, begin))
@@ -313,7 +313,7 @@ class PositionControlledTool:
         self._move_tip()
         key = end, *self.position, self.height
         _append_keyframe(self._path, key)
-        # An active grip has no known end: it ends after any session.
+        # An active grip has no end yet: take one after any session.
         grip = NO_GRIP if self._grip_start is None else (self._grip_start, self._grip_start + 1e9)
         return self._probe.model_copy(update={"path": (key,), "grip": (grip,)})
 
@@ -324,10 +324,10 @@ class PositionControlledTool:
 
     @property
     def _target_height(self) -> float:
-        return _rounded(0.0 - self.depth) if self.engaged else self._hover_height
+        return _round_height(0.0 - self.depth) if self.engaged else self._hover_height
 
     def _move_tip(self) -> None:
-        """Move the tip towards its target, by at most the distance that a frame allows."""
+        """Move the tip towards its target, by at most the distance that a frame permits."""
         max_rise = (HOVER_HEIGHT_RADII * self._radius + self._max_depth) / (RISE_TIME_S * self.grid.frames_per_second)
         rise = self._target_height - self.height
         goal = self._target_height if abs(rise) <= max_rise else self.height + math.copysign(max_rise, rise)
@@ -338,9 +338,9 @@ class PositionControlledTool:
         fraction = min(1.0, max_distance / distance) if distance > 0 else 1.0
         if fraction < 1:
             self.position = on_sheet((across + fraction * (to_across - across), down + fraction * (to_down - down)))
-            self.height = _rounded(self.height + fraction * (goal - self.height))
+            self.height = _round_height(self.height + fraction * (goal - self.height))
         else:
-            self.position, self.height = self.target, _rounded(goal)
+            self.position, self.height = self.target, _round_height(goal)
 
     def _time(self, frame: int) -> float:
         """Return the time of a frame [s], bit-identical to its step, so that the tip is exactly at the keyframe."""

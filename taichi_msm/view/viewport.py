@@ -1,4 +1,4 @@
-"""Camera, light and mesh display of a session, which the user changes."""
+"""Interactive camera, light and mesh display of a session."""
 
 from __future__ import annotations
 
@@ -18,11 +18,11 @@ from taichi_msm.scene.render import AnyCamera, Render
 
 
 class Viewport:
-    """Interactive camera, light and mesh display of a session.
+    """Camera, light and mesh display of a session.
 
     Args:
         renderer: renderer of a scene with the initial settings.
-        play: whether to follow a moving camera of the scene; otherwise it stays at its initial pose.
+        play: whether a moving camera of the scene moves; otherwise it stays at its initial pose.
 
     Attributes:
         render: current drawing settings.
@@ -48,7 +48,7 @@ class Viewport:
         self.view = view(self._renderer.scene.model_copy(update={"render": self.render, "output": ()}), self._time)
 
     def set_time(self, time: float) -> bool:
-        """Move the camera to its pose at a time [s]; return whether it moves."""
+        """Move the camera to its pose at a time [s]; return whether it is a moving camera."""
         self._time = time
         camera = self.render.main_camera
         moving = isinstance(camera, Camera) and camera.moves
@@ -57,7 +57,7 @@ class Viewport:
         return moving
 
     def recorded_render(self, duration: float) -> Render:
-        """Return the drawing settings for a scene of a duration [s]; the last camera pose is held to the end."""
+        """Return the drawing settings for a recorded scene of a duration [s]; the camera keeps its last pose."""
         camera = self.render.main_camera
         if isinstance(camera, Camera) and isinstance(camera.poses, tuple) and camera.poses[-1][0] < duration:
             last = (duration, *camera.poses[-1][1:])

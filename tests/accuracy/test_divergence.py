@@ -5,12 +5,14 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Callable
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 import pytest
 
 from taichi_msm import DivergedError, Simulation
+from taichi_msm.accuracy import diagnosis
 from taichi_msm.accuracy.diagnosis import Diagnosis
 from taichi_msm.accuracy.divergence import displacement_bound
 from taichi_msm.scene.scene import Scene
@@ -20,7 +22,7 @@ from taichi_msm.system.runtime import Device
 from tests.golden import Messages
 from tests.motion import notes_of
 from tests.scenes import SHEET, plan_of, scene, with_steps
-from tests.terms.test_contact import moved
+from tests.terms.test_contact import PRESSED, moved, touching
 
 # Pressed for three frames.
 PRESS = {"force": [0, 300, -1000], "load": [[0, 100], [0.12, 100], [0.12, 0]], "falloff": 20}
@@ -187,11 +189,11 @@ def test_diagnosis_of_an_excessive_force(device: Device, message: Messages) -> N
     harmless = {"force": [0, 0, 1], "at": [0.2, 0.2]}, moved([0, 0.2, 0.2, 0.0], [0.2, 0.2, 0.2, -0.02])
     for probe in harmless:
         made = pressed(probes=[probe, EXCESSIVE])
-        diagnosis = diagnosis_of(made, device)
+        found = diagnosis_of(made, device)
         hide = r"0\.1\d+|(?<=step )\d+|[-.\de]+(?= [ms]\b)"
-        message(diagnosis.message, "probes.1.force, which reaches 454 N", hide=hide)
+        message(found.message, "probes.1.force, which reaches 454 N", hide=hide)
     # The step is the first with a fault: the state before it is sound, and the next frame diverges.
-    bad_step, sound = int(re.findall(r"step (\d+)", diagnosis.message)[0]), diagnosis.last_sound_state
+    bad_step, sound = int(re.findall(r"step (\d+)", found.message)[0]), found.last_sound_state
     assert sound
     assert sound.state.steps == bad_step - 1
     assert np.isfinite(sound.state.displacement).all()
@@ -213,15 +215,23 @@ def test_diagnosis_of_a_step_that_is_too_long(device: Device, message: Messages)
         simulation.advance(3)
 
 
+def test_likely_causes_without_a_stable_step(monkeypatch: pytest.MonkeyPatch, message: Messages) -> None:
+    """A fast tool; and a strong force after so many steps that none is tried."""
+    monkeypatch.setattr(diagnosis, "_is_stable", lambda *_: False)
+    for made, bad_step in (touching([PRESSED]), 1), (pressed(probes=[EXCESSIVE]), 10**12):
+        dynamics: Any = SimpleNamespace(plan=plan_of(made))
+        message(diagnosis._likely_cause(dynamics, bad_step, (2, 3), lambda: None))
+
+
 def test_diagnosis_of_a_hardware_error(device: Device, message: Messages) -> None:
     def flip(simulation: Simulation) -> None:
         simulation.advance(3)
         simulation.restore(with_fault(simulation.save(), "displacement", np.nan, 1))
 
-    diagnosis = diagnosis_of(pressed(), device, flip)
-    message(diagnosis.message, "machine", "--resume", hide=r"(?<=step )\d+|(?<=point )\(.*?\)")
-    assert diagnosis.last_sound_state
-    assert diagnosis.last_sound_state.progress.frame == 1, "the frame of the snapshot"
+    found = diagnosis_of(pressed(), device, flip)
+    message(found.message, "machine", "--resume", hide=r"(?<=step )\d+|(?<=point )\(.*?\)")
+    assert found.last_sound_state
+    assert found.last_sound_state.progress.frame == 1, "the frame of the snapshot"
 
 
 def test_bound_of_displacements() -> None:

@@ -5,16 +5,26 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
+from unittest.mock import Mock
 
 import pytest
 
 from taichi_msm import load_scene, resume, run
 from taichi_msm.accuracy import companions
-from taichi_msm.accuracy.companions import NEGLIGIBLE_ERROR, CompanionRuns, choose_companion_runs
-from taichi_msm.accuracy.mesh import MeshEstimate
+from taichi_msm.accuracy.companions import (
+    NEGLIGIBLE_ERROR,
+    QUASISTATIC_REASON,
+    CompanionRuns,
+    choose_companion_runs,
+)
+from taichi_msm.accuracy.mesh import LARGE_STEP_ERROR, NARROW_TIP, NOT_CONVERGED, OVERLAP, WRINKLING, MeshEstimate
+from taichi_msm.accuracy.run_errors import ForceEstimate, RunErrorEstimates, RunErrorEstimator, run_warnings
 from taichi_msm.accuracy.time_step import TimeStepEstimate
-from taichi_msm.errors import Pause
+from taichi_msm.errors import DeviceError, Pause
+from taichi_msm.model.tool_force import probe_records
+from taichi_msm.runs.run import _choose_companions
 from taichi_msm.scene.scene import Scene
 from taichi_msm.solver.dynamics import Dynamics
 from taichi_msm.solver.planning import affords_companions, choose_precision, with_time
@@ -25,6 +35,7 @@ from tests.golden import Messages
 from tests.motion import notes_of, true_error
 from tests.runs.test_resume import Stop
 from tests.scenes import PRESS, plan_of, scene
+from tests.terms.test_contact import PRESSED, touching
 
 SHORT = ["output=[trajectory]", "time.duration=0.4"]
 
@@ -36,7 +47,7 @@ def run_with_error(overrides: Sequence[str], device: Device, **options: Any) -> 
     """Run small.yaml; return its scene, its record and its estimated error."""
     made = load_scene("small.yaml", overrides)
     record: Any = run(made, "out", threads=device.threads, **options)
-    return made, record, record["error_estimate"]["error"]
+    return made, record, (record["error_estimate"] or {"error": math.nan})["error"]
 
 
 @pytest.mark.parametrize(
@@ -76,6 +87,16 @@ def test_omitted_and_requested_estimates(
     assert Path("out/trajectory.npz").read_bytes() == Path("with/trajectory.npz").read_bytes()
 
 
+def test_missing_estimate_of_a_gpu(
+    small: Path, device: Device, monkeypatch: pytest.MonkeyPatch, message: Messages
+) -> None:
+    context: Any = SimpleNamespace(manifest=SimpleNamespace(asks_estimate=None), device=Device("vulkan", 1))
+    message(_choose_companions(context, resumed=False).reason, "--estimate-error")
+    monkeypatch.setattr("taichi_msm.runs.run.RunErrorEstimator", Mock(side_effect=DeviceError))
+    _, record, _ = run_with_error(SHORT, device)
+    message(record["notes"], "f64")
+
+
 def test_resumed_run_has_the_same_estimate(small: Path, device: Device) -> None:
     made = load_scene("small.yaml", ["output=[png, trajectory]"])
     expected = run(made, "complete", threads=device.threads)
@@ -90,6 +111,26 @@ def test_warnings_of_small_errors_and_short_springs(message: Messages) -> None:
     assert not notes_of(scene(), RunProgress(1, 1.0, 0.51), None)
     assert len(notes_of(scene(), MOVED, TimeStepEstimate(10, 0.009, 0.0, 0.009, 2))) == 1
     message(notes_of(scene(), RunProgress(1, 0.0, 0.49), TimeStepEstimate(40, 1e-3, 1e-4, 1e-3, 2)), "error: time step")
+
+
+def test_warnings_of_missing_and_doubtful_estimates(device: Device, message: Messages) -> None:
+    plan = plan_of(touching([PRESSED]))
+
+    def warnings(errors: RunErrorEstimates) -> list[str]:
+        return list(run_warnings(plan, probe_records(plan.scene), MOVED, errors))
+
+    rounded = TimeStepEstimate(10, 0.02, 0.02, 0.02, 2, separate=False)
+    message(warnings(RunErrorEstimates(rounded, "", MeshEstimate(0.004, WRINKLING), ForceEstimate(0.03))))
+    message(warnings(RunErrorEstimates(reason=QUASISTATIC_REASON, mesh=MeshEstimate(0.004, OVERLAP))))
+    for doubt in (NARROW_TIP, NOT_CONVERGED, LARGE_STEP_ERROR):
+        message(warnings(RunErrorEstimates(mesh=MeshEstimate(math.inf, doubt))), "mesh error not known")
+    estimator = RunErrorEstimator(plan, CompanionRuns(reason="not asked for"), RunErrorEstimates(), device, 1)
+    message(warnings(estimator.estimates), "force error not known")
+
+
+def test_warnings_of_springs_and_damping(message: Messages) -> None:
+    message(notes_of(scene(), RunProgress(1, 1.0, longest_spring=2.1), None))
+    message(notes_of(scene(damping=1.0, time={"step": 0.04}), MOVED, None))
 
 
 @pytest.mark.parametrize("error", [0.015, 0.04])

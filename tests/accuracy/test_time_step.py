@@ -158,6 +158,18 @@ def test_tolerance_out_of_reach_of_f32(device: Device, message: Messages) -> Non
         choose_step(plan_of(made), device)
 
 
+@pytest.mark.parametrize(("error", "at_most"), [(math.inf, False), (0.02, False), (0.02, True), (0.6, True)])
+def test_tolerance_out_of_reach_of_any_step(
+    error: float, at_most: bool, device: Device, monkeypatch: pytest.MonkeyPatch, message: Messages
+) -> None:
+    def estimate(_: TimeStepTrials, steps: int, progress: object) -> TimeStepEstimate:
+        return TimeStepEstimate(steps, error, 0.0, error, 1, at_most=at_most)
+
+    monkeypatch.setattr(TimeStepTrials, "estimate", estimate)
+    with message.raises(SceneError, "time.tolerance: 0.001 "):
+        choose_step(plan_of(scene(time={"tolerance": 1e-3})), device)
+
+
 @pytest.mark.slow
 def test_tolerance_of_a_motion_that_does_not_converge(device: Device, message: Messages) -> None:
     # Pushed in along the sheet without damping, the points collide and scatter.

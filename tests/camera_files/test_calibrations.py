@@ -277,12 +277,13 @@ distortion_model: radial-tangential
 distortion_coefficients: [-0.3, 0.1, 0.001, -0.002]
 """
 OMNIDIR = f"camera_matrix: {MATRIX.tolist()}\ndistortion_coefficients: {COEFFICIENTS[:4]}\nxi: [[1.25]]\ndim: 40 30\n"
+MEI = f"{OMNIDIR}distortion_model: mei\n"
 
 
 @pytest.mark.parametrize(
     ("text", "model", "first"),
-    [(EUROC, "pinhole", []), (OMNIDIR, "omnidir", [1.25]), (OMNI_KALIBR, "omnidir", [1.25])],
-    ids=["EuRoC", "OpenCV's omnidir", "Kalibr's omni"],
+    [(EUROC, "pinhole", []), (OMNIDIR, "omnidir", [1.25]), (MEI, "omnidir", [1.25]), (OMNI_KALIBR, "omnidir", [1.25])],
+    ids=["EuRoC", "OpenCV's omnidir", "Mei's model", "Kalibr's omni"],
 )
 def test_euroc_and_omnidirectional(text: str, model: str, first: list[float], small: Path) -> None:
     calibration = read(text)
@@ -365,7 +366,8 @@ NORMALISED = "D: [0, 0, 0, 0]\nK: [0.837, 0, 0.5, 0, 1.1, 0.5, 0, 0, 1]\n"
         pytest.param(K + D + "dist: [-0.31, 0.1, 0.001, -0.002, 0.03]", id="two distortions"),
         pytest.param(K + "dist: [0, 0, 0, 0]\ndist: [1, 0, 0, 0]\n", id="key twice"),
         pytest.param("[StereoLeft]\nfc_x = 3\nfc_x = 4\n", id="key of an ini file twice"),
-        pytest.param(K + D + "distortion_model: mei", id="unsupported model"),
+        pytest.param(K + D + "distortion_model: division", id="unsupported model"),
+        pytest.param(K + "D: [1.27, 0, 0, 0, 0]\ndistortion_model: mei", id="omnidirectional without xi"),
         pytest.param(K + D + "distortion_model: none", id="coefficients of no model"),
         pytest.param(K + "D: [0, 0, 0, 0]\nfisheye_model: 1\ndistortion_model: plumb_bob", id="two models"),
         pytest.param(K + D + "fisheye: maybe", id="flag"),
@@ -432,12 +434,15 @@ def test_check_prints_the_calibration(small: Path, capsys: pytest.CaptureFixture
     message(lines, "render.cameras.left: pinhole, 40 x 30 px", "k1 -0.3")
 
 
-def test_field_of_view_beyond_the_projection(small: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_field_of_view_beyond_the_projection(
+    small: Path, capsys: pytest.CaptureFixture[str], message: Messages
+) -> None:
     # The left and right edges are 104 degrees from the axis, the upper and lower ones 78.
     Path("camera.yml").write_text("K: [11, 0, 19.5, 0, 11, 14.5, 0, 0, 1]\nD: [0, 0, 0, 0]\nfisheye: true\n")
     camera = READ.replace("FILE", "camera.yml, outside: background")
     assert not main(["check", "small.yaml", "--set", camera, "--set", "output=[]"])
-    assert "40 x 30 px, fov (limited by the lens) x 156.3 degrees" in capsys.readouterr().out
+    lines = [line for line in capsys.readouterr().out.splitlines() if line.startswith("render.camera")]
+    message(lines, "156.3 degrees")
 
 
 def test_focal_length_in_other_units(small: Path, message: Messages) -> None:
@@ -468,6 +473,10 @@ def test_camera_json(small: Path) -> None:
     assert (calibration.model, calibration.focal, calibration.size) == ("omnidir", (60, 61), (40, 30))
     assert calibration.centre == (19.5, 14.5)
     assert calibration.coefficients == {"xi": 1.1, "k1": 0.1, "k2": 0.0, "p1": 0.01, "p2": 0.02}
+    # A field of view of 175 degrees is allowed, and its focal length is in pixels.
+    wide = {"model": "pinhole", "calibration": [[0.87, 0, 19.5], [0, 0.87, 14.5], [0, 0, 1]], "distortion": [0] * 8}
+    Path("camera.json").write_text(json.dumps({**camera, **wide}))
+    load_scene("small.yaml", {"render.camera": {"eye": [0, 0, 0.1], "calibration": "camera.json"}})
 
 
 ONE = "KN: [60, 0, 20, 0, 60, 15, 0, 0, 1]\nDN: [0, 0, 0, 0]\n"

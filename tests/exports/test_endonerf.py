@@ -46,7 +46,7 @@ def load(folder: Path) -> tuple[Array, Array, list[Array], list[Array], list[Arr
     return poses, bounds, images, masks, [each.astype(float) for each in pictures["depth"]]
 
 
-def test_loaders_of_endonerf_and_endogaussian(labelled_in_motion: Path, tmp_path: Path) -> None:
+def test_loaders_of_endonerf_and_endogaussian(labelled_in_motion: Path, tmp_path: Path, message: Messages) -> None:
     run = labelled_in_motion
     done = export(run, "endonerf", tmp_path / "out")
     poses, bounds, images, masks, depths = load(done.directory)
@@ -83,8 +83,7 @@ def test_loaders_of_endonerf_and_endogaussian(labelled_in_motion: Path, tmp_path
         # A pixel's middle is up to 0.71 px from the point, 0.011 of its depth of 0.5 m; the sheet is tilted.
         assert visible.sum() > 5
         assert np.linalg.norm(ends[row, column] - points[visible], axis=-1).max() * UNIT < 0.02
-    assert any("0.01 mm" in note for note in done.notes)
-    assert any("640 x 512" in note for note in done.notes)
+    message(done.notes, "0.01 mm", "640 x 512")
 
 
 def test_unit_of_large_depths(labelled_in_motion: Path, tmp_path: Path) -> None:

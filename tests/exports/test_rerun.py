@@ -14,7 +14,10 @@ import pytest
 from PIL import Image
 
 from taichi_msm import NotInstalledError, export
+from taichi_msm.exports import rerun
 from taichi_msm.model.surface import place_instruments
+from taichi_msm.render.camera import view_at
+from taichi_msm.render.lens import IDENTITY_LENS
 from taichi_msm.runs.arrays import read_flo
 from taichi_msm.runs.finished import read_run
 from tests.golden import Messages
@@ -84,6 +87,14 @@ def test_recording_round_trip(labelled_in_motion: Path, tmp_path: Path) -> None:
     assert sorted(flow) == [0, 1]
     values = np.array(flow[1][0]["buffer"], np.float32).reshape(HEIGHT, WIDTH, 2)
     np.testing.assert_array_equal(values, read_flo(run / "flow/0001.flo", (WIDTH, HEIGHT)))
+
+
+def test_warning_of_distortion(
+    labelled_in_motion: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, message: Messages
+) -> None:
+    pytest.importorskip("rerun.chunk")
+    monkeypatch.setattr(rerun, "view_at", lambda *arguments: view_at(*arguments)._replace(lens=IDENTITY_LENS))
+    message(export(labelled_in_motion, "rerun", tmp_path / "out").notes, "distortion")
 
 
 def test_entities_of_several_cameras(stereo: Path, message: Messages) -> None:

@@ -638,7 +638,7 @@ def test_false_rejections_by_a_pattern(correlation: ErrorCorrelation) -> None:
     rejections = 0
     for _ in range(400):
         residuals = rng.normal(0, 1, (36, 9, 2))
-        residuals += 0 if correlation.correlation is None else rng.normal(0, 2, (1, 9, 2))
+        residuals += 0 if correlation.length is None else rng.normal(0, 2, (1, 9, 2))
         residuals = residuals if correlation.drift is None else np.cumsum(residuals, axis=1)
         residuals[rng.random(residuals.shape) < 0.05] *= 10
         residuals[rng.random(residuals.shape[:2]) < 0.1] = np.nan

@@ -268,7 +268,7 @@ def test_bits_depend_neither_on_workers_nor_on_segments(
     def bits(workers: int) -> bytes:
         adjoint = MotionAdjoint(plan, device, layout=replace(choose_layout(plan, device), workers=workers))
         by_sheet, loads = adjoint.backward(loss(adjoint.run())[1])
-        arrays = [*by_sheet.springs, by_sheet.tensions, by_sheet.foundation, *loads.by_key.values()]
+        arrays: list[Any] = [*by_sheet.springs, by_sheet.tensions, by_sheet.foundation, *loads.by_key.values()]
         arrays += [by_sheet.bending, by_sheet.keep, by_sheet.gain, by_sheet.first_gain]
         return b"".join(np.asarray(array).tobytes() for array in arrays)
 

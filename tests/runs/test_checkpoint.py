@@ -204,6 +204,16 @@ def test_parts_of_another_run(name: str, out: Path, tmp_path: Path) -> None:
         read(out)
 
 
+def test_frame_that_is_not_a_number(out: Path) -> None:
+    checkpoint = checkpoint_in(out)
+    checkpoint.reopen()
+    checkpoint.frames = 1
+    checkpoint.add(np.full((2, 3, 3), math.nan), forces(1))  # with a valid checksum
+    checkpoint.close()
+    with pytest.raises(DamagedError):
+        read(out)
+
+
 FORGED_MANIFESTS: dict[str, dict[str, Any]] = {
     "folder": {"folder": 3},
     "version": {"versions": {"taichi": 1}},

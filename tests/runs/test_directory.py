@@ -1,5 +1,7 @@
 from __future__ import annotations
 
+import errno
+import fcntl
 import json
 import os
 import re
@@ -142,6 +144,24 @@ def test_concurrent_publication_is_refused(directory: Path, message: Messages) -
     assert_tidy(directory)
 
 
+def test_lock_in_a_deleted_folder(directory: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Between opening a lock and locking it, the run that holds it may end and delete it."""
+    flock, locked = fcntl.flock, list[int]()
+
+    def lock_late(file: int, operation: int) -> None:
+        if not locked:
+            (directory / ".partial" / "lock").unlink()
+        locked.append(file)
+        flock(file, operation)
+
+    monkeypatch.setattr(fcntl, "flock", lock_late)
+    with Publication(directory, RUN_PUBLICATION):
+        assert len(locked) == 2
+        monkeypatch.undo()
+        with pytest.raises(FilesError), Publication(directory, RUN_PUBLICATION):
+            pass
+
+
 def test_leftovers_of_a_killed_run_are_deleted(directory: Path) -> None:
     write(directory / ".partial", ["lock", "earlier.json", "new/frames/0000.png", "whole/frames/0000.png"], "stale")
     with Publication(directory, RUN_PUBLICATION) as publication:
@@ -160,6 +180,14 @@ def test_missing_staged_file(directory: Path, message: Messages) -> None:
     assert_tidy(directory)
 
 
+def test_forged_new_results_replace_no_foreign_files(tmp_path: Path, message: Messages) -> None:
+    write(tmp_path, ["animation.gif", "trajectory.npz"], "mine")
+    write(tmp_path / ".partial" / "whole", ["animation.gif", "run.json"], "new")
+    with message.raises(ForeignError, "animation.gif"), Publication(tmp_path, RUN_PUBLICATION):
+        pass
+    assert contents(tmp_path) == expected(["animation.gif", "trajectory.npz"], "mine")
+
+
 def test_foreign_files_are_kept(directory: Path, message: Messages) -> None:
     """Files with names of results that the record does not list."""
     write(directory, ["frames/0100.png"], "mine")
@@ -169,6 +197,12 @@ def test_foreign_files_are_kept(directory: Path, message: Messages) -> None:
     with message.raises(ForeignError, "animation.gif"):
         publish(directory, OLD)
     assert contents(directory) == {**expected(NEW, "new"), "frames/0100.png": "mine", "animation.gif": "mine"}
+
+
+def test_unwritable_folder_of_results(directory: Path, monkeypatch: pytest.MonkeyPatch, message: Messages) -> None:
+    monkeypatch.setattr(os, "access", lambda path, mode: Path(path).name != "frames")
+    with message.raises(PermissionError, "frames"), Publication(directory, RUN_PUBLICATION, NEW):
+        pass
 
 
 def test_abandoned_hidden_folders_are_deleted(tmp_path: Path) -> None:
@@ -201,6 +235,18 @@ def test_links_in_hidden_folders_are_not_followed(tmp_path: Path) -> None:
         pass
     assert (treasure / "lock").is_dir()
     assert not (treasure / "notes.txt").exists()
+
+
+def test_folder_is_kept_on_a_disk_without_locks(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def refuse(*_: object) -> None:
+        raise OSError(errno.ENOLCK, "no locks")
+
+    monkeypatch.setattr(fcntl, "flock", refuse)
+    with hidden_folder(tmp_path) as film:
+        (film / "animation.gif").touch()
+        with hidden_folder(tmp_path):
+            pass
+        assert (film / "animation.gif").exists()
 
 
 def test_atomic_replacement_of_a_file(tmp_path: Path) -> None:

@@ -57,6 +57,7 @@ def small_scene(*output: str, precision: str = "f32", **render: Any) -> Scene:
         sheet={"points": [ROWS, COLS], "size": [0.3, 0.4], "mass": 1e-3},
         time={"precision": precision},
         render={"size": [WIDTH, HEIGHT], **render},
+        probes=[],
         output=list(output or ("png", "gif", "trajectory")),
     )
 

@@ -325,6 +325,12 @@ def test_one_device_per_process(device: Device, message: Messages) -> None:
         Simulation(scene(), threads=device.threads + 1)
 
 
+def test_html_of_a_frame(simulation: Simulation, message: Messages) -> None:
+    page = simulation._repr_html_()
+    assert page
+    message(page.partition("<figcaption>")[2])
+
+
 def test_free_cores(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(process, "available_threads", lambda: 4)
     made = scene(render={"size": [512, 512]}, time={"step": 0.001})

@@ -29,7 +29,7 @@ Plant = Callable[[Path, Path], None]
 
 def small_scene() -> Scene:
     sheet = {"points": [3, 4], "size": [0.3, 0.4], "mass": 1e-3}
-    return scene(image="texture.png", sheet=sheet, render={"size": [8, 6]}, output=["png", "trajectory"])
+    return scene(image="texture.png", sheet=sheet, render={"size": [8, 6]}, probes=[], output=["png", "trajectory"])
 
 
 def write(directory: Path, *, resumes: bool = False) -> None:

@@ -174,7 +174,9 @@ def test_invalid_quasi_static_scenes(small: Path, device: Device, message: Messa
         check_scene(at_rest([PUSH], time={"motion": "dynamic"}))
 
 
-def test_companion_run_that_does_not_converge(device: Device, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_companion_run_that_does_not_converge(
+    device: Device, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, message: Messages
+) -> None:
     def diverges(*_: Any) -> None:
         raise DivergedError("", 0, 0.0, (0, 0))
 
@@ -189,7 +191,7 @@ def test_companion_run_that_does_not_converge(device: Device, tmp_path: Path, mo
     record = run(made, tmp_path / "out", threads=device.threads)
     assert record["error_estimate"] is not None
     assert record["error_estimate"]["mesh_error"] is None
-    assert record["notes"][0] == "mesh error not known: the run with fewer points diverged"
+    message(record["notes"], "mesh error not known")
 
 
 UP_AND_DOWN = [[0, 0], [4, 100], [8, 0]]
@@ -202,21 +204,22 @@ def pulled_sideways(force: float = 12.0, **tissue: float) -> Scene:
     return at_rest([tool], sheet={"points": [25, 25], "size": [0.1, 0.1]}, tissue=soft, time={"duration": 8})
 
 
-def test_warning_of_path_dependence(device: Device, tmp_path: Path) -> None:
+def test_warning_of_path_dependence(device: Device, tmp_path: Path, message: Messages) -> None:
     """Without pretension it wrinkles: the solution of a frame from rest differs by a tenth or more."""
 
     def notes(made: Scene, folder: str) -> list[str]:
         record = run(made, tmp_path / folder, threads=device.threads)
         return [note for note in record["notes"] if note.startswith("path-dependent")]
 
-    (note,) = notes(pulled_sideways(bending=1e-5), "wrinkled")
-    assert re.search(r"loaded at once.* \d\d % of the largest displacement", note)
-    assert "tissue.pretension, bending or a stiffer foundation" in note
+    # 10 % or more of the largest displacement.
+    message(
+        notes(pulled_sideways(bending=1e-5), "wrinkled"), "tissue.pretension", hide=r"at \d s, frame \d|\b\d\d(?= %)"
+    )
     assert not notes(pulled_sideways(2.0, pretension=20), "taut")
     assert not notes(loaded(), "held")
 
 
-def test_warning_of_a_jump() -> None:
+def test_warning_of_a_jump(message: Messages) -> None:
     """The sheet moves in proportion to its load, and jumps at a frame."""
     plan = plan_of(pulled_sideways())
 
@@ -231,8 +234,7 @@ def test_warning_of_a_jump() -> None:
     assert not notes(0)
     # 0.0025 m per frame.
     assert not notes(4.9 * 0.0025)
-    (note,) = notes(5.1 * 0.0025)
-    assert note.startswith("path-dependent at 3 s, frame 3: since the previous frame the sheet jumped by 67 %")
+    message(notes(5.1 * 0.0025), "path-dependent at 3 s, frame 3", "67 %")
 
 
 def test_second_solution_of_a_unique_equilibrium(device: Device) -> None:

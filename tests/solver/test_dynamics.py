@@ -318,6 +318,22 @@ def test_interrupted_launch(device: Device, monkeypatch: pytest.MonkeyPatch, mes
     assert dynamics.displacement().tobytes() == expected.tobytes()
 
 
+def test_interrupted_restart(device: Device, monkeypatch: pytest.MonkeyPatch, message: Messages) -> None:
+    dynamics = dynamics_of(scene(), device)
+
+    def interrupted(*_: object) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(dynamics, "_build_kernel", interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        dynamics.restart(dynamics.plan)
+    with message.raises(MsmError):
+        dynamics.compile()
+    monkeypatch.undo()
+    dynamics.restart(dynamics.plan)
+    dynamics.advance(1)
+
+
 def test_kernels_are_reused(device: Device, monkeypatch: pytest.MonkeyPatch) -> None:
     """A sheet of the same terms compiles nothing, whatever its size and coefficients."""
     dynamics_of(scene(), device).compile()

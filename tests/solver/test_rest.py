@@ -272,6 +272,17 @@ def test_divergence_without_support(device: Device, message: Messages) -> None:
         assert "nothing holds" in simulation.diagnose().message
 
 
+@pytest.mark.parametrize("tools", [1, 2])
+def test_divergence_of_a_held_sheet(
+    tools: int, device: Device, monkeypatch: pytest.MonkeyPatch, message: Messages
+) -> None:
+    """Two tools that press on one point are named."""
+    monkeypatch.setattr("taichi_msm.solver.rest.MAX_EVALUATIONS", 2)
+    rest = QuasiStatics(plan_of(at_rest([PRESSED] * tools)), device)
+    with message.raises(DivergedError, "frame 1", hide=r"\d[\d.e-]+(?= of)|(?<=point )\(\d, \d\)"):
+        rest.advance(1)
+
+
 def test_warning_of_a_grip_between_frames(message: Messages) -> None:
     plan = plan_of(at_rest([moved([0, 0.5, 0.5, 0.001], grip=[[0.2, 0.8], [0.9, 1.5]])]))
     message((note for note in path_warnings(plan.scene, plan.tools) if "grip" in note), "probes.0.grip from 0.2 ")

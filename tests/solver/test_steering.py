@@ -9,6 +9,8 @@ import pytest
 
 from taichi_msm import ArgumentError, Probe, SceneError, Simulation
 from taichi_msm.system.runtime import Device
+from taichi_msm.terms.contact import ContactTerm
+from taichi_msm.terms.loads import ProbeTerm
 from tests.golden import Messages
 from tests.motion import assert_steered_like
 from tests.scenes import plan_of
@@ -132,6 +134,15 @@ def test_changes_that_require_other_kernels(device: Device, message: Messages) -
             with message.raises(ArgumentError):
                 simulation.steer(probes)
         simulation.steer([{"path": [[0.1, *AT]]}, FORCE])
+
+
+def test_terms_that_require_other_kernels(message: Messages) -> None:
+    plate = {**PRESSED, "instrument": {"plate": 0.04, "shaft": [0, 0, 1], "length": 0.3}}
+    flat, round_ = (ContactTerm.from_plan(plan_of(touching([tool]))) for tool in (plate, PRESSED))
+    assert flat
+    assert round_
+    message(flat.supports(round_))
+    message(ProbeTerm((False,), (True,)).supports(ProbeTerm((False,), (False,))))
 
 
 def test_flight_after_a_tool_stops(device: Device) -> None:

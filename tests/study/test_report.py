@@ -10,6 +10,7 @@ from dataclasses import replace
 from itertools import product
 from pathlib import Path
 from typing import Any
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -67,7 +68,7 @@ def realistic() -> Study:
     for supersample, refine in product((1, 2, 4), (0, 1, 2, 5)):
         psnr, samples = 50 + 5 * supersample - 4 / (1 + refine) ** 4, spread(0.01 * supersample**2)
         study.drawing.append(DrawingMeasurement(refine, supersample, psnr, 12 - refine, samples=samples))
-    study.notes = ["drawing was not measured from refine 10, supersample 4 on: memory"]
+    study.notes = ["drawing was not measured from refine 10, supersample 4 on, for lack of memory"]
     return study
 
 
@@ -115,8 +116,10 @@ def odd() -> Study:
 
 
 def strict() -> Study:
-    """The tolerance is smaller than all errors."""
-    return replace(realistic(), tolerance=5e-7)
+    """The tolerance is smaller than all errors, of a scene with contact."""
+    study = realistic()
+    settings = {**study.settings, "probes": [{"path": [[0, 0.5, 0.5, 0]]}]}
+    return replace(study, tolerance=5e-7, settings=settings)
 
 
 CASES = [of_tissue, interrupted, motionless, without_reference, odd, strict]
@@ -213,6 +216,13 @@ def test_missing_matplotlib(tmp_path: Path) -> None:
     assert json.loads((tmp_path / "study.json").read_text())["notes"] == study.notes
     assert WITHOUT_MATPLOTLIB in page(tmp_path)
     assert f"note: {WITHOUT_MATPLOTLIB}" in format_summary(study)
+
+
+def test_plot_that_fails(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, message: Messages) -> None:
+    monkeypatch.setattr("taichi_msm.study.plot.plot", Mock(side_effect=ValueError("reason")))
+    study = realistic()
+    assert write_report(study, tmp_path) == FILES[1:]
+    message(study.notes, "study.png", "ValueError")
 
 
 @pytest.mark.usefixtures("no_picture")

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from typing import Any
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -12,6 +13,7 @@ from pydantic import BaseModel
 
 from taichi_msm.accuracy.mesh import with_points
 from taichi_msm.accuracy.time_step import max_norm
+from taichi_msm.errors import SceneError
 from taichi_msm.model.plan import Plan
 from taichi_msm.model.sheet import rest_positions
 from taichi_msm.scene.scene import Scene
@@ -27,6 +29,8 @@ from taichi_msm.study.measurements import (
     mesh_plans,
 )
 from taichi_msm.study.result import DrawingMeasurement, SteppingMeasurement, Study, observed_orders
+from taichi_msm.study.study import run_study
+from taichi_msm.system import process
 from taichi_msm.system.runtime import Device
 from tests import reference
 from tests.golden import Messages
@@ -252,6 +256,23 @@ def test_errors_of_pictures_are_those_of_the_twin(device: Device, monkeypatch: p
         for each in renders
     )
     assert psnr[0, 1] == pytest.approx(10 * np.log10(255**2 / ((fine - coarse) ** 2).mean()), abs=0.1)
+
+
+def test_warnings_of_a_study(device: Device, monkeypatch: pytest.MonkeyPatch, message: Messages) -> None:
+    """Without a picture; interrupted; with memory for neither the reference picture nor the trajectories."""
+
+    def interrupt(*_: object) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("taichi_msm.study.study.SteppingStudy", Mock())
+    monkeypatch.setattr("taichi_msm.study.study.MeshStudy", Mock(side_effect=interrupt))
+    message(run_study(scene(), "name", threads=device.threads).notes, "image", "interrupted")
+    monkeypatch.setattr(process, "available_memory", lambda: 0)
+    study, rest = study_of(scene()), rest_positions(scene().sheet)
+    measure_pictures(scene(), rest, speckle(20, 30), False, study, progress)
+    message(study.notes, "memory")
+    with message.raises(SceneError, "time.duration"):
+        run_study(scene(), "name", threads=device.threads)
 
 
 def test_psnr() -> None:

@@ -14,6 +14,7 @@ from functools import partial
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
+from unittest.mock import Mock
 
 import pytest
 
@@ -29,6 +30,7 @@ from tests.sweeps.conftest import CALIBRATION, POSES
 
 distributed = pytest.importorskip("distributed", reason="needs dask.distributed: pip install distributed")
 
+from taichi_msm.sweeps import cluster as dask_cluster  # noqa: E402
 from taichi_msm.sweeps.cluster import Inputs, cluster_connection  # noqa: E402
 
 SWEEP = """\
@@ -239,6 +241,18 @@ def test_unreachable_schedulers(
     assert result.returncode == 2
     # The reason is a text of dask.
     message(json.loads(result.stdout)["errors"], address, word, hide="missing port.*(?=; )")
+
+
+def test_lost_connections(monkeypatch: pytest.MonkeyPatch, message: Messages) -> None:
+    inputs: Any = None
+    with message.raises(MsmError, "packages"):
+        register = Mock(side_effect=ImportError("No module named 'numpy'"))
+        dask_cluster._register_inputs(inputs, "inputs", Mock(register_plugin=register))
+    with message.raises(MsmError):
+        dask_cluster._wait_for_worker(Mock(nthreads=Mock(side_effect=OSError)), lambda stage, done, total: None)
+    monkeypatch.setattr(dask_cluster, "get_worker", lambda: SimpleNamespace(plugins={}))
+    with message.raises(MsmError):
+        dask_cluster._inputs("inputs")
 
 
 def test_inputs_removed_by_another_command(lab: Path, cluster: Callable[[int], str]) -> None:

@@ -261,6 +261,7 @@ FAULTS: dict[str, tuple[dict[str, Any], str]] = {
     "a varied key": ({"variables": {"damping": {"uniform": [0, 1]}}}, "variables.damping"),
     "a function": ({"variables": {"max": {"uniform": [0, 1]}}}, "variables.max"),
     "unknown variable": (expression("=radius + 1", radios={"uniform": [0, 1]}), "set.probes.0.force.1"),
+    "no variables": (expression("=radius + 1"), "set.probes.0.force.1"),
     "too large a power": (expression("=x * 9**9**9", x={"uniform": [0, 1]}), "set.probes.0.force.1"),
     "not allowed": (expression("=__import__('os').getpid()"), "set.probes.0.force.1"),
     "no expression": (expression("=2 x"), "set.probes.0.force.1"),

@@ -18,6 +18,7 @@ from concurrent.futures import Executor, Future, ProcessPoolExecutor
 from multiprocessing import get_context
 from pathlib import Path
 from typing import Any
+from unittest.mock import Mock
 
 import pytest
 from PIL import Image
@@ -26,7 +27,7 @@ from taichi_msm import sweep
 from taichi_msm.errors import ArgumentError, MsmError, SceneError
 from taichi_msm.sweeps import tables
 from taichi_msm.sweeps.pool import PARENT_POLL_S, DiedError, Pool
-from taichi_msm.sweeps.runs import Outcome, RunTask, SweepState, begin_sweep, run_missing
+from taichi_msm.sweeps.runs import Outcome, RunTask, SweepState, begin_sweep, execute_run, run_missing
 from taichi_msm.sweeps.spec import load_sweep, make_sweep
 from taichi_msm.sweeps.sweep import finish_sweep
 from tests.conftest import Program
@@ -348,6 +349,21 @@ def test_refused_runs_are_final_and_failed_ones_are_repeated(many: Path, pool: P
     assert [row.status for row in outcomes()] == ["complete", "refused"]
 
 
+def test_versions_of_another_machine(many: Path, program: Program, message: Messages) -> None:
+    begin_sweep(load_sweep("many.yaml"), Path("out"))
+    record = json.loads(Path("out/sweep.json").read_text())
+    Path("out/sweep.json").write_text(json.dumps({**record, "versions": {**record["versions"], "numpy": "0.1"}}))
+    done = program("sweep", "many.yaml", "--out", "out")
+    assert done.returncode == 2
+    message(done.stderr, "numpy 0.1")
+
+
+def test_bug_in_a_run(many: Path, monkeypatch: pytest.MonkeyPatch, message: Messages) -> None:
+    monkeypatch.setattr("taichi_msm.sweeps.runs._run_scene", Mock(side_effect=RuntimeError("reason")))
+    (task, *_) = begin_sweep(load_sweep("many.yaml"), Path("out")).missing
+    message(execute_run(task, quiet).error, "RuntimeError")
+
+
 def kill_own_process() -> None:
     os.kill(os.getpid(), signal.SIGKILL)
 
@@ -356,6 +372,8 @@ def test_pool_replaces_a_killed_process(message: Messages) -> None:
     pool = Pool(2)
     with message.raises(DiedError, "SIGKILL"):
         pool.submit(kill_own_process).result()
+    with message.raises(DiedError):
+        pool.submit(os._exit, 3).result()
     assert os.getpid() != pool.submit(os.getpid).result()
     with pytest.raises(ValueError, match="invalid literal"):
         pool.submit(int, "a").result()

@@ -22,7 +22,6 @@ from taichi_msm import sweep
 from taichi_msm.errors import ForeignError
 from taichi_msm.plot_style import STYLE
 from taichi_msm.sweeps.plots import (
-    WITHOUT_PICTURES,
     abbreviate_keys,
     estimate_sensitivity,
     first_order_index,
@@ -34,7 +33,7 @@ from taichi_msm.sweeps.plots import (
 from taichi_msm.sweeps.pool import Pool
 from taichi_msm.sweeps.runs import REPORT_FILES, Outcome, SweepState, begin_sweep
 from taichi_msm.sweeps.spec import make_sweep
-from taichi_msm.sweeps.tables import WITHOUT_MATPLOTLIB, WITHOUT_SALIB, assign_splits, write_reports
+from taichi_msm.sweeps.tables import assign_splits, summary_lines, write_reports
 from tests.golden import Messages
 
 VARY = {
@@ -186,7 +185,9 @@ def test_picture_of_an_animation_at_a_time(tmp_path: Path) -> None:
         assert read_gif_frame(tmp_path / "a.gif", time).getcolors() == [(40 * 30, colour)]
 
 
-def test_earlier_reports_are_replaced_atomically(make: Make, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_earlier_reports_are_replaced_atomically(
+    make: Make, monkeypatch: pytest.MonkeyPatch, message: Messages
+) -> None:
     """Also when the drawing is interrupted, or another report fails."""
     result = make(128)
     for name in REPORT_FILES:
@@ -206,19 +207,25 @@ def test_earlier_reports_are_replaced_atomically(make: Make, monkeypatch: pytest
     names, notes = write(result)
     assert names == ["table.csv", "table.parquet", "dataset.json", "sensitivity.csv"]
     assert {path.name for path in result.directory.iterdir()} == {"runs", "sweep.png", *names}
-    assert notes[1].startswith("sweep.png could not be written: ")
+    message(notes, "sweep.png", hide=r"(?<=written: ).*")
 
 
-def test_missing_libraries(make: Make, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_missing_libraries(make: Make, monkeypatch: pytest.MonkeyPatch, message: Messages) -> None:
     for name in ("matplotlib", "SALib", "SALib.analyze", "pyarrow"):
         monkeypatch.setitem(sys.modules, name, None)
     monkeypatch.delitem(sys.modules, "taichi_msm.sweeps.plots", raising=False)
     names, notes = write(make(128))
     assert names == ["table.csv", "dataset.json"]
-    assert notes == [WITHOUT_PICTURES, WITHOUT_SALIB, WITHOUT_MATPLOTLIB]
+    message(notes, "output: [png]", "SALib", "matplotlib")
 
 
-def test_plots_of_the_most_sensitive_parameters(make: Make) -> None:
+def test_reports_without_a_complete_run(make: Make, message: Messages) -> None:
+    state = make(2)
+    state.outcomes = [Outcome(run, "diverged", "why", 9.0) for run in range(2)]
+    message(write(state)[1])
+
+
+def test_plots_of_the_most_sensitive_parameters(make: Make, message: Messages) -> None:
     style = pytest.importorskip("matplotlib.style")
     from taichi_msm.sweeps.plots import PlotData, _figure
 
@@ -236,7 +243,7 @@ def test_plots_of_the_most_sensitive_parameters(make: Make) -> None:
     assert names[0] == "damping"
     (omitted,) = {parameter.name for parameter in varied} - set(names)
     assert min(indices, key=lambda index: index.first_order).parameter == omitted
-    assert f"Not shown, as less sensitive: {omitted}." in figure.get_supxlabel().replace("\n", " ")
+    message(" ".join(figure.get_supxlabel().split()), omitted)
     # Crosses at the bottom edge mark the failed runs.
     crosses = np.asarray(figure.axes[0].collections[1].get_offsets())
     assert crosses.tolist() == [[number, 0] for number in varied[0].numbers[failed]]
@@ -311,6 +318,12 @@ def test_data_set_of_several_sizes(small: Path, pool: Pool) -> None:
     assert {path.name for path in Path("out").iterdir()} == {
         *("runs", "sweep.json", "table.csv", "table.parquet", "dataset.json", "contact.jpg"),
     }
+
+
+def test_summary_lines(message: Messages) -> None:
+    outcomes = [Outcome(run, "complete", "", 0.1, notes=(f"a warning of {run} m",)) for run in range(3)]
+    outcomes[0] = Outcome(0, "refused", "damping: too large")
+    message(summary_lines(Path("out"), outcomes, (1, 2), [], []), "--shard")
 
 
 def test_foreign_files_stay(make: Make, message: Messages) -> None:

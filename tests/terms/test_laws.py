@@ -209,11 +209,12 @@ def test_f32_resolves_long_relaxation_times(device: Device) -> None:
     np.testing.assert_allclose(memories[0], memories[1], rtol=0, atol=1e-3 * np.abs(memories[1]).max())
 
 
-def test_step_with_and_without_lock(tmp_path: Path, program: Program) -> None:
+def test_step_with_and_without_lock(tmp_path: Path, program: Program, message: Messages) -> None:
     data = pressed("sheet") | {"time": {"duration": 0.1, "frames_per_second": 40}}
     data["tissue"] |= {"foundation": 0, "stiffening": {"lock": 0.1}}
     (tmp_path / "s.yaml").write_text(yaml.safe_dump(data))
-    assert "s, 3.2 times shorter than without lock)" in program("check", str(tmp_path / "s.yaml")).stdout
+    lines = program("check", str(tmp_path / "s.yaml")).stdout.splitlines()
+    message((line for line in lines if " steps of " in line), "3.2 times")
 
 
 def test_relaxation_has_no_gradient(device: Device, message: Messages) -> None:

@@ -264,10 +264,10 @@ def test_impossible_tolerances(load: Any, device: Device, message: Messages) -> 
         choose_points(plan_of(made), device, check_scene)
 
 
-def test_wrinkles_make_the_estimate_a_lower_bound(load: Any, device: Device) -> None:
+def test_wrinkles_make_the_estimate_a_lower_bound(load: Any, device: Device, message: Messages) -> None:
     """Without bending or tension, finer meshes under an in-plane load have more wrinkles."""
     pushed = ("tissue.foundation=1.0e5", "probes.0.total=[1.5, 0.3, -0.3]", "tissue.damping=400")
-    assert mesh_estimate(load("sheet.points=[25, 25]", *pushed), device).doubt
+    message(mesh_estimate(load("sheet.points=[25, 25]", *pushed), device).doubt)
     stiff = ("tissue.bending=plate", "tissue.thickness=5.0e-3")
     assert not mesh_estimate(load("sheet.points=[25, 25]", *pushed, *stiff), device).doubt
 
@@ -285,12 +285,6 @@ def test_record_of_tool_and_mesh(load: Any, device: Device, tmp_path: Path, mess
     assert probe["largest_pressure"] == pytest.approx(2 / area, rel=1e-6)
     message(record["notes"], ", mesh ", "for a smaller error of the mesh, ", hide=r"[\d.]+(?= %| mm| px)")
     message((line for line in run_summary(record, tmp_path).splitlines() if "probes.0: " in line), "1.27 kPa")
-
-
-def test_warning_of_large_strain(load: Any, device: Device, tmp_path: Path) -> None:
-    record = run(load("probes.0.total=[0, 0, -60]", "tissue.foundation=0"), tmp_path / "out", threads=device.threads)
-    assert record["longest_spring"] > 2
-    assert any("times its rest length, which no tissue withstands" in note for note in record["notes"])
 
 
 def test_warning_of_a_partial_tool(load: Any, message: Messages) -> None:

@@ -230,7 +230,7 @@ def test_reset(begin: Begin) -> None:
     assert session.recorded_scene().time.duration == pytest.approx(5 / session.frame_rate)
 
 
-def test_change_of_material_keeps_positions_and_velocities(begin: Begin) -> None:
+def test_change_of_material_keeps_positions_and_velocities(begin: Begin, message: Messages) -> None:
     changed, same = begin(TILTED), begin(TILTED)
     for session in (changed, same):
         session.handle(Press(60, 50))
@@ -247,6 +247,8 @@ def test_change_of_material_keeps_positions_and_velocities(begin: Begin) -> None
     expected = begin({**TILTED, "springs.structural": 180.0})
     expected.handle(Press(60, 50))
     assert advance(changed, 150)[-1] == pytest.approx(advance(expected, 160)[-1], abs=1e-4)
+    changed.handle(Key("w"))
+    message(changed.notice, "reset (r)")
     changed.handle(Key("r"))
     assert (displacement(changed) < AT_REST).all()
     assert changed.material()["springs.structural"] == (180.0, 20.0)
@@ -310,7 +312,7 @@ def test_press_outside_the_sheet(begin: Begin, message: Messages) -> None:
     assert session.notice == ""
 
 
-def test_saved_files_have_free_names(begin: Begin) -> None:
+def test_saved_files_have_free_names(begin: Begin, message: Messages) -> None:
     Path("captures").mkdir()
     Path("captures/speckle.png").write_bytes(b"another picture")
     session = begin(TILTED)
@@ -330,6 +332,10 @@ def test_saved_files_have_free_names(begin: Begin) -> None:
     assert scene.time.duration == pytest.approx(10 / session.frame_rate)
     assert scene.image == "captures/speckle-2.png"
     assert Path("captures/speckle.png").read_bytes() == b"another picture"
+    message(Path("captures/session-2.yaml").read_text().partition("\n")[0])
+    Path("speckle.png").unlink()
+    with message.raises(FilesError, "speckle.png"):
+        session.handle(Key("w"))
 
 
 def test_film_has_the_duration_of_the_session(begin: Begin) -> None:
@@ -426,6 +432,8 @@ def test_divergence_is_reported_and_reset(begin: Begin, message: Messages) -> No
     frame = session.frame
     advance(session, 3)
     assert session.frame == frame
+    session.handle(Material("springs.structural", 30.0))
+    message(session.notice, "reset it (r)")
     session.handle(Key("w"))
     assert session.notice == "saved captures/session-1.yaml"
     again = run(load_scene("captures/session-1.yaml", {"output": []}), "again", threads=2)
@@ -469,8 +477,8 @@ def test_scenes_without_a_session(
 
 
 def test_units_of_lengths_and_forces(message: Messages) -> None:
-    message(map(live_session.length, (0.0, 1.33e-7, 1.67e-6, 1e-5, 8.284e-4, 0.0621, 12.3)))
-    message(map(live_session.newtons, (0.0, 0.514, 9.63, 123.4)))
+    message(map(live_session.format_length, (0.0, 1.33e-7, 1.67e-6, 1e-5, 8.284e-4, 0.0621, 12.3)))
+    message(map(live_session.format_force, (0.0, 0.514, 9.63, 123.4)))
 
 
 def instrument_pixels(session: Session) -> set[tuple[int, int]]:
@@ -618,14 +626,14 @@ def test_force_is_shown_with_a_bar(begin: Begin, message: Messages) -> None:
         session.handle(Strength(percent))
         advance(session, 20)
         largest = max(largest, session.felt_force())
-    (figures, *_) = session._figure_lines()
-    assert figures.endswith(live_session.newtons(session.felt_force()))
-    message(figures, "45 mm", hide=r"[\d.]+ N")
+    (readings, *_) = session._reading_lines()
+    assert readings.endswith(live_session.format_force(session.felt_force()))
+    message(readings, "45 mm", hide=r"[\d.]+ N")
     bar = overlay.ValueBar(session.felt_force(), largest, "N")
     assert bar_of(session.picture()) == pytest.approx(session.felt_force() / bar.end, abs=0.02)
     session.handle(Key("r"))
     session.handle(Strength(40))
-    message(session._figure_lines()[0], "30 mm", "0 N")
+    message(session._reading_lines()[0], "30 mm", "0 N")
     assert (session.picture()[40:70, :130] == bare[40:70, :130]).all(), "without a force there is no bar"
 
 

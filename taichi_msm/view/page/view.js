@@ -1,13 +1,13 @@
-// The page of a live session: pictures and readings come by a WebSocket, events of pointer, keys and sliders go back.
+// Page of a live session: receives pictures and readings by a WebSocket, and sends events of pointer, keys and sliders.
 "use strict";
 
 const element = id => document.getElementById(id);
 const canvas = element("picture");
 const picture = canvas.getContext("2d");
 
-// Readings of the plots: the last seconds against time, and of them against depth.
+// Both plots show the readings of these last seconds.
 const WINDOW_S = 8;
-const MAX_MATERIAL_RATE_MS = 80;
+const MATERIAL_INTERVAL_MS = 80;
 const WHEEL_NOTCH_PX = 100, WHEEL_NOTCH_LINES = 3;
 const RETRY_MS = 1000;
 
@@ -33,7 +33,7 @@ function physical(value, unit) {
   return unit === "1/s" ? `${Number(value.toPrecision(3))} ${unit}` : withPrefix(value, unit).join(" ");
 }
 
-function figure(id, number, unit) {
+function showNumber(id, number, unit) {
   const small = document.createElement("small");
   small.textContent = ` ${unit}`;
   element(id).replaceChildren(number, small);
@@ -95,6 +95,9 @@ function describe(message) {
   document.documentElement.style.setProperty("--ratio", session.size[0] / session.size[1]);
   document.querySelectorAll(".material").forEach(row => row.remove());
   session.material.forEach(entry => element("sliders").append(materialRow(entry)));
+  for (const button of document.querySelectorAll("button[data-key]")) {
+    button.title = `${session.keys[button.dataset.key]} (${button.dataset.key})`;
+  }
   element("keys").replaceChildren(...Object.entries(session.keys).map(pair => {
     const row = document.createElement("tr");
     row.append(...pair.map(text => Object.assign(document.createElement("td"), {textContent: text})));
@@ -112,9 +115,9 @@ function update(next) {
   const first = readings.findIndex(([time]) => time > state.time - WINDOW_S);
   readings.splice(0, Math.max(0, first - 1));
   const [, force, depth] = readings.at(-1) ?? [0, 0, 0];
-  figure("force", ...withPrefix(Math.abs(force) < 1e-6 ? 0 : force, "N"));
-  figure("depth", digits(1e3 * depth), "mm");
-  figure("time", state.time.toFixed(1), "s");
+  showNumber("force", ...withPrefix(Math.abs(force) < 1e-6 ? 0 : force, "N"));
+  showNumber("depth", digits(1e3 * depth), "mm");
+  showNumber("time", state.time.toFixed(1), "s");
   element("pacing").textContent = state.pacing;
   showNotice(state.notice);
   showRole();
@@ -153,7 +156,7 @@ function showControls() {
   }
 }
 
-// ---- sliders: those that are held do not follow the session
+// ---- sliders: a held one does not follow the session
 
 const held = new Set();
 
@@ -174,10 +177,10 @@ function materialRow({key, name, initial}) {
   row.append(label, Object.assign(document.createElement("output"), {id: `${key}-value`}), slider);
   let waiting = false;
   const apply = () => {
-    // The sheet is set up anew for each value.
+    // Every value restarts the solver.
     if (waiting) return;
     waiting = true;
-    setTimeout(() => { waiting = false; steer("material", key, initial * 10 ** slider.value); }, MAX_MATERIAL_RATE_MS);
+    setTimeout(() => { waiting = false; steer("material", key, initial * 10 ** slider.value); }, MATERIAL_INTERVAL_MS);
   };
   slider.addEventListener("input", apply);
   slider.addEventListener("dblclick", () => { slider.value = 0; apply(); });
@@ -194,7 +197,7 @@ const pointers = new Map();
 let action = null, last = null;
 
 function pixel(event) {
-  // Whole numbers are centres of pixels.
+  // Whole numbers are pixel centres.
   const box = canvas.getBoundingClientRect(), scale = canvas.width / box.width;
   return [event.clientX - box.left, event.clientY - box.top].map(length => Math.round(100 * (scale * length - 0.5)) / 100);
 }
@@ -242,7 +245,7 @@ canvas.addEventListener("pointermove", event => {
 for (const name of ["pointerup", "pointercancel"]) {
   canvas.addEventListener(name, event => {
     pointers.delete(event.pointerId);
-    // A finger that stays after a turn does nothing.
+    // After a turn, a remaining finger does nothing.
     if (pointers.size === 0) letGo();
     else last = centre();
   });
@@ -261,7 +264,7 @@ canvas.addEventListener("wheel", event => {
 const NAMES = {" ": "space", "=": "up", "+": "up", ArrowUp: "up", "-": "down", ArrowDown: "down"};
 
 function keyName(event) {
-  // Where a key types no Latin letter, its position names it.
+  // A key that types no Latin letter is named by its position.
   const typed = event.key.length === 1 && event.key > "\x7f" ? event.code.replace("Key", "") : event.key;
   const name = NAMES[typed] ?? typed.toLowerCase();
   return session && name in session.keys ? name : null;
@@ -282,8 +285,8 @@ function press(name) {
   else steer("key", name);
 }
 
-for (const button of document.querySelectorAll("button[data-key], button[data-local]")) {
-  button.addEventListener("click", () => press(button.dataset.key ?? button.dataset.local));
+for (const button of document.querySelectorAll("button[data-key]")) {
+  button.addEventListener("click", () => press(button.dataset.key));
 }
 
 for (const button of document.querySelectorAll("button[data-mode]")) {
@@ -295,40 +298,40 @@ for (const button of document.querySelectorAll("button[data-mode]")) {
 
 // ---- plots
 
-let planned = false;
+let isPending = false;
 
 function plotSoon() {
-  if (planned) return;
-  planned = true;
-  requestAnimationFrame(() => { planned = false; plot(); });
+  if (isPending) return;
+  isPending = true;
+  requestAnimationFrame(() => { isPending = false; drawPlots(); });
 }
 
 function colour(name) {
   return getComputedStyle(document.documentElement).getPropertyValue(`--${name}`);
 }
 
-// Round steps of an axis, about as many as wanted.
-function ticks(low, high, wanted) {
-  const rough = (high - low) / wanted, power = 10 ** Math.floor(Math.log10(rough));
+// About `count` multiples of a round step between two values.
+function ticks(low, high, count) {
+  const rough = (high - low) / count, power = 10 ** Math.floor(Math.log10(rough));
   const step = [1, 2, 5, 10].map(digit => digit * power).find(step => step >= rough * 0.999);
   const result = [];
   for (let n = Math.ceil(low / step - 1e-9); n * step <= high + 1e-9 * step; n++) result.push(n * step);
   return result;
 }
 
-// A range that holds the values, begins at 0 or below, and ends at a round number.
-function range(values, least) {
-  const low = Math.min(0, ...values), high = Math.max(low + least, ...values);
+// Limits of an axis: 0 or a round number below the values, and a round number above them; at least minLength apart.
+function range(values, minLength) {
+  const low = Math.min(0, ...values), high = Math.max(low + minLength, ...values);
   const step = ticks(low, high, 3)[1] - ticks(low, high, 3)[0];
   return [low < -1e-9 ? Math.floor(low / step) * step : 0, Math.ceil(high / step - 1e-9) * step];
 }
 
 function drawPlot(id, points, [left, right], [bottom, top], {x, y, fades}) {
-  const sheet = element(id), width = sheet.clientWidth, height = sheet.clientHeight, ratio = devicePixelRatio;
-  if (sheet.width !== Math.round(width * ratio) || sheet.height !== Math.round(height * ratio)) {
-    [sheet.width, sheet.height] = [width * ratio, height * ratio];
+  const plot = element(id), width = plot.clientWidth, height = plot.clientHeight, ratio = devicePixelRatio;
+  if (plot.width !== Math.round(width * ratio) || plot.height !== Math.round(height * ratio)) {
+    [plot.width, plot.height] = [width * ratio, height * ratio];
   }
-  const pen = sheet.getContext("2d"), edge = {left: 40, right: 10, top: 8, bottom: 20};
+  const pen = plot.getContext("2d"), edge = {left: 40, right: 10, top: 8, bottom: 20};
   const column = value => edge.left + (value - left) / (right - left) * (width - edge.left - edge.right);
   const row = value => height - edge.bottom - (value - bottom) / (top - bottom) * (height - edge.top - edge.bottom);
   pen.setTransform(ratio, 0, 0, ratio, 0, 0);
@@ -363,7 +366,7 @@ function drawPlot(id, points, [left, right], [bottom, top], {x, y, fades}) {
   pen.lineWidth = 2;
   pen.strokeStyle = colour("force");
   if (fades) {
-    // In pieces that fade with age.
+    // Older pieces of the line are more transparent.
     const pieces = 24, size = Math.ceil(points.length / pieces);
     for (let begin = 0; begin < points.length; begin += size) {
       pen.globalAlpha = 0.35 + 0.65 * Math.min(1, (begin + size) / points.length);
@@ -389,10 +392,10 @@ function drawPlot(id, points, [left, right], [bottom, top], {x, y, fades}) {
   pen.restore();
 }
 
-function plot() {
+function drawPlots() {
   if (!state) return;
-  const greatest = Math.max(0, ...readings.map(([, force]) => force));
-  const [factor, unit] = greatest > 0 && greatest < 0.1 ? [1e3, "mN"] : greatest >= 1000 ? [1e-3, "kN"] : [1, "N"];
+  const largest = Math.max(0, ...readings.map(([, force]) => force));
+  const [factor, unit] = largest > 0 && largest < 0.1 ? [1e3, "mN"] : largest >= 1000 ? [1e-3, "kN"] : [1, "N"];
   const forces = readings.map(([, force]) => force * factor), depths = readings.map(([, , depth]) => 1e3 * depth);
   const axis = range(forces, factor === 1 ? 0.1 : 1), end = Math.max(WINDOW_S, state.time);
   drawPlot("by-time", readings.map(([time], n) => [time, forces[n]]), [end - WINDOW_S, end], axis, {x: "s", y: unit});
