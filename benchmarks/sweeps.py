@@ -65,7 +65,7 @@ class Timing(NamedTuple):
 
 
 def data_set(folder: Path, cache: str, number: int, films: int) -> Timing:
-    """Make a data set of some films."""
+    """Create a data set of some films."""
     content = yaml.safe_load(DATA_SET.read_text())
     # In the folder of the shipped file, which contains relative paths.
     file, out = DATA_SET.with_name(f"benchmark-{os.getpid()}.yaml"), folder / f"films-{number}"

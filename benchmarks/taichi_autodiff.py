@@ -72,7 +72,7 @@ class Differentiated:
         self._assemble, self._begin, self._step, self._evaluate = assemble, begin, step, evaluate
 
     def run(self) -> None:
-        """Take all steps."""
+        """Advance by all steps."""
         for k in self._stiffness:
             k.fill(0)
         self._assemble()
@@ -82,7 +82,7 @@ class Differentiated:
         ti.sync()
 
     def differentiate(self) -> None:
-        """Take all steps, and propagate the gradient back."""
+        """Advance by all steps, and propagate the gradient back."""
         self.run()
         self._loss[None] = 0
         self._evaluate()

@@ -1,4 +1,4 @@
-"""Make the pictures of the README and of the pages on scenes, labels, sweeps and live sessions.
+"""Draw the pictures of the README and of the pages on scenes, labels, sweeps and live sessions.
 
     PYTHONPATH=. python docs/make_figures.py
 
@@ -192,7 +192,7 @@ def live(name: str, size: int, rate: float, seconds: float) -> None:
 
 
 def page(width: int, height: int) -> None:
-    """Take a screenshot of a session with the scene press, with a stiffer foundation at the end."""
+    """Save a screenshot of a session with the scene press, with a stiffer foundation at the end."""
 
     async def press(session: Session, folder: Path) -> None:
         server = Server(session, listen(0), "scenes/press.yaml")
@@ -262,7 +262,7 @@ def main() -> None:
     endoscope(224)
     four_pixels()
     stereo(0.8, 400)
-    animation("retina", "press", 320, "render.camera=top", image=RETINA)
+    animation("retina", "grasp", 320, image=RETINA)
     indentation()
     palpation()
     live("live", 250, 10, 4.8)

@@ -1,4 +1,4 @@
-"""Make the pictures of labels.md and its lines on flow and stereo pairs, with the residuals of both.
+"""Draw the pictures of labels.md and its lines on flow and stereo pairs, with the residuals of both.
 
     PYTHONPATH=. python docs/make_labels.py
 

@@ -208,7 +208,7 @@ def prose_of(file: Path) -> set[str]:
             isinstance(node, ast.Call) and CALLS_WITHOUT_MESSAGES.fullmatch(ast.unparse(node.func))
         ):
             ignored |= {id(inner) for inner in ast.walk(node)}
-        elif isinstance(node, ast.Assign) and ast.unparse(node.targets[0]).lower().endswith("meaning"):
+        elif isinstance(node, ast.Assign) and ast.unparse(node.targets[0]).lower().endswith(("meaning", "names")):
             ignored.add(id(node.value))
     texts = {
         part

@@ -35,7 +35,7 @@ class Stepper(Planes):
         self._share = np.ascontiguousarray(problem.load[0] / self._force[0])
 
     def advance(self, steps: int) -> None:
-        """Take the steps in one call."""
+        """Advance by all steps in one call."""
         n = self._share.shape[0]
         self._advance(self._now, self._before, self._share, self._force, self._numbers, n, self._done, steps)
         self._count(steps)

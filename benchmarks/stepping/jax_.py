@@ -47,7 +47,7 @@ class Stepper:
         self._advance = advance
 
     def advance(self, steps: int) -> None:
-        """Take the steps in one call."""
+        """Advance by all steps in one call."""
         self._state = jax.block_until_ready(self._advance(self._state, self._load, steps))
 
     def displacement(self) -> Array:

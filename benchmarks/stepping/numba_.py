@@ -73,7 +73,7 @@ def step_row(ux, uy, uz, wx, wy, wz, share, i, load, dx, dy, diagonal, structura
 def advance(
     now, before, share, load, dx, dy, diagonal, structural, shear, virtual, keep, gain, first_gain, done, steps
 ):
-    """Take the steps; now and before, shape (3, n, n), alternate."""
+    """Advance by all steps; now and before, shape (3, n, n), alternate."""
     n = share.shape[0]
     for step in range(done, done + steps):
         this_gain = gain if step else first_gain
@@ -105,7 +105,7 @@ class Stepper(Planes):
         self._share = np.ascontiguousarray(problem.load[0] / self._load[0])
 
     def advance(self, steps: int) -> None:
-        """Take the steps in one call."""
+        """Advance by all steps in one call."""
         advance(self._now, self._before, self._share, self._load, *self._numbers, self._done, steps)
         self._count(steps)
 

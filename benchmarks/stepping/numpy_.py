@@ -19,7 +19,7 @@ class Stepper:
         self._started = False
 
     def advance(self, steps: int) -> None:
-        """Take the steps one by one."""
+        """Advance step by step."""
         inner = np.s_[:, 1:-1, 1:-1]
         for _ in range(steps):
             self._sum_forces()

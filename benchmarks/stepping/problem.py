@@ -42,7 +42,7 @@ class Stepper(Protocol):
     """A peer's sheet, at rest at first; the module of each peer has `prepare(problem, threads)`, which returns one."""
 
     def advance(self, steps: int) -> None:
-        """Take a number of steps, and wait until they are done."""
+        """Advance by a number of steps, and wait until they are done."""
 
     def displacement(self) -> Array:
         """Return the displacements [m], shape (n, n, 3)."""

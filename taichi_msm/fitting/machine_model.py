@@ -16,7 +16,14 @@ from taichi_msm.fitting.observation import Array, ObservationModel
 from taichi_msm.fitting.parameters import Bounds, Method, Parameter, as_data, make_parameters, with_values
 from taichi_msm.fitting.predict import FitProblem, ForwardModel, Prediction, without_outputs
 from taichi_msm.load.check import check_scene
-from taichi_msm.machines.loading import Approach, Loading, build_loading, find_approach, late_contact_note
+from taichi_msm.machines.loading import (
+    Approach,
+    Loading,
+    build_loading,
+    find_approach,
+    late_contact_note,
+    require_plausible_travel,
+)
 from taichi_msm.machines.reader import cut_window, read_machine_test
 from taichi_msm.model.plan import Plan
 from taichi_msm.runs.simulation import Simulation
@@ -197,6 +204,7 @@ def read_machine_problem(
             test = cut_window(test, *window)
         contact = contacts[n if len(contacts) > 1 else 0] if contacts else None
         loading = build_loading(test, scene, rate, contact, is_clamp=approach.is_clamp)
+        require_plausible_travel(loading, scene)
         is_estimated = contact is None and not approach.is_clamp and key not in free
         if is_estimated and (note := late_contact_note(loading, key)):
             loading = replace(loading, test=replace(loading.test, notes=(*loading.test.notes, note)))

@@ -196,6 +196,15 @@ def build_loading(
     return Loading(test, rate, time, depth, force, noise, contact)
 
 
+def require_plausible_travel(loading: Loading, scene: Scene) -> None:
+    """Raise a SceneError if the tool travels ten sizes of the sheet or more, probably because of another unit."""
+    travel, side = float(loading.travel().max()), max(scene.sheet.size)
+    if travel > 10 * side:
+        fault = f"depth: the tool travels {travel:.4g} m, and the sheet is {side:g} m long"
+        remedy = "write the unit in the header, such as [mm], or in --columns 'depth=NAME, mm'"
+        raise SceneError([f"{loading.test.name}: {fault}; {remedy}"])
+
+
 def _count_noise_rows(test: MachineTest) -> int:
     """Return the number of first rows, which the noise is estimated from."""
     return max(10, math.ceil(0.05 * len(test.force)))

@@ -302,11 +302,12 @@ class _Run:
         writer, simulation, scene = self._writer, self._simulation, self._context.plan.scene
         stage, rest = self._stopwatch.stage, rest_positions(scene.sheet)
         observed = dict.fromkeys(scene.render.all_cameras, FrameOutputs())
-        # The first frame and redrawn frames have no steps. They are another stage, because they would distort the
+        # The first frame and redrawn frames have no steps. They are other stages, because they would distort the
         # estimate of the remaining time.
-        redrawn_frames = max(self._resumed_frames, 1)
         for frame in range(0 if scene.output else writer.frames, self._frames):
-            stage_name, total = ("redraw", redrawn_frames) if frame < redrawn_frames else ("frames", self._frames)
+            stage_name, total = ("frames", self._frames) if frame else ("start", 1)
+            if frame < self._resumed_frames:
+                stage_name, total = "redraw", self._resumed_frames
             report = partial(self._progress, stage_name, frame, total)
             report()
             with stage("simulate"):

@@ -277,7 +277,7 @@ def build_advance(config: KernelConfig, *, parallel: bool) -> Callable[..., None
         d_x: vectors, d_y: vectors, d_z: vectors,
         constants_of: ti.types.ndarray(dtype=vector, ndim=1), by_column: vectors, stiffness: vectors, fields: vectors,
     ):  # fmt: skip
-        """Take the steps of a launch, from the workers' recorded progress on.
+        """Advance by the steps of a launch, from the workers' recorded progress on.
 
         Args:
             sizes: integer arguments of the launch, in the order of FIRST, ..., MAX_CHECKS.

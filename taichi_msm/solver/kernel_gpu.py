@@ -134,7 +134,7 @@ def _build_advance(config: KernelConfig) -> Callable[..., None]:
         d_x: vectors, d_y: vectors, d_z: vectors,
         constants_of: ti.types.ndarray(dtype=vector, ndim=1), by_column: vectors, stiffness: vectors, fields: vectors,
     ):  # fmt: skip
-        """Take the steps of a launch.
+        """Advance by the steps of a launch.
 
         Args:
             buffer: index of the buffer with u_n, 0 or 1.

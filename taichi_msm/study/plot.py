@@ -226,7 +226,7 @@ def _scale_errors(axes: Axes, points: Sequence[ErrorMeasurement], tolerance: flo
 
 
 def _scale(axes: Axes, axis: str, values: Iterable[float], min_decades: float) -> None:
-    """Make an axis logarithmic, with a margin around the values and at least `min_decades` decades."""
+    """Set a logarithmic scale of an axis, with a margin around the values and at least `min_decades` decades."""
     exponents = [math.log10(value) for value in values if _drawable(value)]
     low, high = min(exponents), max(exponents)
     margin = max(0.07 * (high - low), (min_decades - (high - low)) / 2)

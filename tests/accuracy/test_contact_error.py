@@ -85,7 +85,8 @@ def test_mesh_estimate_bounds_the_error(seed: int, image: str, device: Device) -
     mesh = estimates_of(plan, device).mesh
     assert mesh.at_most or mesh.error == math.inf
     error = true_mesh_error(plan.with_grid(precision="f64"), device, refinement=4, steps=8)
-    assert error <= (2 if mesh.doubt else 1.5) * mesh.error or mesh.doubt == OVERLAP
+    # The bound of tools that run through each other is rough.
+    assert error <= (4 if mesh.doubt == OVERLAP else 2 if mesh.doubt else 1.5) * mesh.error
 
 
 TISSUE = {"young": 3e4, "thickness": 2e-3, "density": 1050, "foundation": 1.3e5, "damping": 200, "pretension": 40}

@@ -97,14 +97,19 @@ def test_missing_estimate_of_a_gpu(
     message(record["notes"], "f64")
 
 
-def test_resumed_run_has_the_same_estimate(small: Path, device: Device) -> None:
+@pytest.mark.parametrize("tool", [False, True])
+def test_resumed_run_has_the_same_estimate(tool: bool, small: Path, device: Device) -> None:
+    """Of displacements, and of the forces of a tool."""
     made = load_scene("small.yaml", ["output=[png, trajectory]"])
-    expected = run(made, "complete", threads=device.threads)
-    interrupted = run(made, "parts", threads=device.threads, progress=Stop(3))
+    if tool:
+        made = touching([PRESSED], tissue={"young": 1e3, "thickness": 0.01, "density": 1000}, output=["trajectory"])
+    expected: Any = run(made, "complete", threads=device.threads, estimate_error=True)
+    interrupted = run(made, "parts", threads=device.threads, estimate_error=True, progress=Stop(3))
     assert interrupted["status"] == "interrupted"
     resumed = resume("parts", threads=device.threads)
     assert resumed["status"] == "complete"
     assert resumed["error_estimate"] == expected["error_estimate"]
+    assert bool(expected["error_estimate"].get("force_error")) == tool
 
 
 def test_warnings_of_small_errors_and_short_springs(message: Messages) -> None:
@@ -122,10 +127,12 @@ def test_warnings_of_missing_and_doubtful_estimates(device: Device, message: Mes
     rounded = TimeStepEstimate(10, 0.02, 0.02, 0.02, 2, separate=False)
     message(warnings(RunErrorEstimates(rounded, "", MeshEstimate(0.004, WRINKLING), ForceEstimate(0.03))))
     message(warnings(RunErrorEstimates(reason=QUASISTATIC_REASON, mesh=MeshEstimate(0.004, OVERLAP))))
+    message(warnings(RunErrorEstimates(mesh=MeshEstimate(0.02, WRINKLING))))
     for doubt in (NARROW_TIP, NOT_CONVERGED, LARGE_STEP_ERROR):
         message(warnings(RunErrorEstimates(mesh=MeshEstimate(math.inf, doubt))), "mesh error not known")
-    estimator = RunErrorEstimator(plan, CompanionRuns(reason="not asked for"), RunErrorEstimates(), device, 1)
-    message(warnings(estimator.estimates), "force error not known")
+    for known in (RunErrorEstimates(), RunErrorEstimates(mesh=MeshEstimate(0.004))):
+        estimator = RunErrorEstimator(plan, CompanionRuns(reason="not asked for"), known, device, 1)
+        message(warnings(estimator.estimates), "force error not known")
 
 
 def test_warnings_of_springs_and_damping(message: Messages) -> None:

@@ -257,6 +257,15 @@ def test_numbers_after_10000_steps(image: str, device: Device) -> None:
         assert_second_order(known, float(np.asarray(numbers[name])[index]), step, changed, name)
 
 
+def test_pause_after_every_launch(image: str, device: Device, monkeypatch: pytest.MonkeyPatch) -> None:
+    adjoint, launch = adjoint_of(moving("tissue", image), device), MotionAdjoint._launch
+    _, by_frame = loss(adjoint.run())
+    launched, pause = Mock(side_effect=launch), Mock()
+    monkeypatch.setattr(MotionAdjoint, "_launch", lambda *arguments: launched(*arguments))
+    adjoint.backward(by_frame, pause)
+    assert pause.call_count == launched.call_count > 2
+
+
 def test_bits_depend_neither_on_workers_nor_on_segments(
     image: str, device: Device, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -4,8 +4,10 @@ import json
 import math
 import os
 import shutil
+import sys
 from pathlib import Path
 from typing import Any
+from unittest.mock import Mock
 
 import pytest
 from PIL import Image
@@ -227,3 +229,10 @@ def test_estimated_duration_of_check(small: Path, program: Program, message: Mes
     assert json.loads(after)["estimated_seconds"] == json.loads(before)["estimated_seconds"], (
         "the estimate is independent of earlier runs"
     )
+
+
+def test_memory_of_systems_without_proc(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(process, "_free_memory", Mock(side_effect=FileNotFoundError))
+    assert 2**20 < available_memory() < sys.maxsize
+    monkeypatch.delattr(os, "sysconf")
+    assert available_memory() == sys.maxsize

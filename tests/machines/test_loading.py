@@ -17,6 +17,7 @@ from taichi_msm.machines.loading import (
     build_loading,
     find_approach,
     late_contact_note,
+    require_plausible_travel,
 )
 from taichi_msm.machines.reader import MachineTest
 from taichi_msm.scene.scene import Scene
@@ -123,6 +124,17 @@ def test_tables_without_a_contact_are_refused(case: str, message: Messages) -> N
     test = table(TIME, 20 - TIME if case == "depth" else TIME, force, 0.01)
     with message.raises(SceneError, "press.csv"):
         build_loading(test, scene(), contact=11.0 if case == "contact" else None)
+
+
+def test_travel_in_another_unit(message: Messages) -> None:
+    """The sheet is 20 mm long."""
+    for unit in (1e-3, 1.0):
+        loading = build_loading(table(TIME, unit * TIME, RAMP, 0.01), scene())
+        if unit < 1:
+            require_plausible_travel(loading, scene())
+        else:
+            with message.raises(SceneError, "press.csv: depth", "[mm]"):
+                require_plausible_travel(loading, scene())
 
 
 @pytest.mark.parametrize(

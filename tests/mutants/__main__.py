@@ -1,4 +1,4 @@
-"""Make one mistake at a time in a copy of the project, and check that a test fails.
+"""Insert one mistake at a time in a copy of the project, and check that a test fails.
 
 python -m tests.mutants              all of them
 python -m tests.mutants richardson   some of them, by name

@@ -15,9 +15,9 @@ from taichi_msm.render.labels import LABELS
 from taichi_msm.scene.scene import Scene
 from taichi_msm.shapes import SHAPES
 from taichi_msm.system.runtime import Device
+from tests.lenses.test_lenses import INTRINSICS, LENSES
 from tests.reference import labels as twin
 from tests.render.test_labels import crumpled, draw_labels, folded
-from tests.render.test_lens import INTRINSICS, LENSES
 from tests.render.test_rasterizer import NEAR, dented, drawable, with_instruments
 
 Array = NDArray[np.float64]

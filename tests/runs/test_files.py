@@ -13,6 +13,7 @@ from _thread import interrupt_main
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -21,9 +22,9 @@ from PIL import Image
 
 from taichi_msm.errors import FilesError
 from taichi_msm.render.labels import Flow, FrameOutputs
-from taichi_msm.runs import media
+from taichi_msm.runs import encoder, media
 from taichi_msm.runs.checkpoint import is_unfinished
-from taichi_msm.runs.encoder import Encoder
+from taichi_msm.runs.encoder import Encoder, PictureWriter
 from taichi_msm.runs.writer import ResultWriter
 from taichi_msm.scene.scene import Scene
 from tests.golden import Messages
@@ -213,6 +214,29 @@ def test_interruption_during_encoding_in_threads(
         writer.publish({})
         frames = writer.frames
     write(tmp_path / "whole", frames, small_scene())
+    assert files(tmp_path / "interrupted") == files(tmp_path / "whole")
+
+
+def test_interruption_between_still_and_film(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The still is written late, after the interruption."""
+
+    def write_late(*arguments: Any) -> float:
+        time.sleep(0.1)
+        return write_still(*arguments)
+
+    write_still = encoder._write_still
+    with ResultWriter(tmp_path / "interrupted", plan_of(small_scene()), encode_in_subprocess=False) as writer:
+        writer.add(position(0), observed(0))
+        assert isinstance(writer._encoder, PictureWriter)
+        with monkeypatch.context() as patch:
+            patch.setattr(writer._encoder._video_executor, "submit", Mock(side_effect=KeyboardInterrupt))
+            patch.setattr(encoder, "_write_still", write_late)
+            with pytest.raises(KeyboardInterrupt):
+                writer.add(position(1), observed(1))
+        writer.finish()
+        time.sleep(0.2)
+        writer.publish({})
+    write(tmp_path / "whole", 1, small_scene())
     assert files(tmp_path / "interrupted") == files(tmp_path / "whole")
 
 

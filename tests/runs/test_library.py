@@ -49,6 +49,7 @@ def simulation(device: Device) -> Iterator[Simulation]:
 
 
 def test_public_names(message: Messages) -> None:
+    assert dir(taichi_msm) == sorted(taichi_msm.__all__)
     for name in taichi_msm.__all__:
         exported = getattr(taichi_msm, name)
         assert exported.__name__ == name
@@ -323,6 +324,12 @@ def test_free_sheet_under_a_constant_force(device: Device) -> None:
 def test_one_device_per_process(device: Device, message: Messages) -> None:
     with message.raises(taichi_msm.DeviceError, hide=active_compiler().title):
         Simulation(scene(), threads=device.threads + 1)
+
+
+def test_steered_tool_is_drawn_with_its_instrument(simulation: Simulation) -> None:
+    bare, probe = simulation.draw(), simulation.scene.probes[0]
+    simulation.steer([probe.model_copy(update={"instrument": {"radius": 0.02, "shaft": [0, 0, 1], "length": 0.1}})])
+    assert (simulation.draw() != bare).any()
 
 
 def test_html_of_a_frame(simulation: Simulation, message: Messages) -> None:

@@ -71,6 +71,18 @@ def test_restored_and_interrupted_simulation(device: Device) -> None:
         assert simulation.progress.residual <= FORCE_TOLERANCE
 
 
+def test_first_frame_is_in_equilibrium(device: Device) -> None:
+    with Simulation(at_rest([{**PRESSED, "path": [[0, 0.5, 0.5, 0.0]]}, PUSH]), threads=device.threads) as simulation:
+        forces = simulation.forces()
+        first = simulation.positions().copy()
+        assert simulation.frame == simulation.steps == 0
+        assert simulation.progress.evaluations > 10
+        assert forces[1].force != (0, 0, 0)
+        simulation.restart()
+        assert simulation.positions().tobytes() == first.tobytes()
+        assert simulation.forces() == forces
+
+
 def test_restart_between_quasi_static_and_dynamic(device: Device) -> None:
     tissue = {**TISSUE, "density": 1000, "damping": 10}
     still, moving = at_rest([PUSH], tissue=tissue), at_rest([PUSH], tissue=tissue, time={"motion": "dynamic"})

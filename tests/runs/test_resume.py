@@ -63,7 +63,7 @@ class Stop:
         self._left = after
 
     def __call__(self, stage: str, done: int, total: int) -> None:
-        self._left -= stage in ("redraw", "frames")
+        self._left -= stage in ("start", "redraw", "frames")
         if self._left < 0 and stage != "write":
             raise KeyboardInterrupt
 

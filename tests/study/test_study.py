@@ -36,7 +36,7 @@ from tests import reference
 from tests.golden import Messages
 from tests.motion import frames_on
 from tests.scenes import PRESS, plan_of, scene, speckle
-from tests.terms.test_contact import PRESSED, touching
+from tests.terms.test_contact import PRESSED, moved, touching
 
 SOFT_PRESS = {**PRESS, "force": [0, 300, -1000]}
 
@@ -256,6 +256,16 @@ def test_errors_of_pictures_are_those_of_the_twin(device: Device, monkeypatch: p
         for each in renders
     )
     assert psnr[0, 1] == pytest.approx(10 * np.log10(255**2 / ((fine - coarse) ** 2).mean()), abs=0.1)
+
+
+@pytest.mark.slow
+def test_steps_are_limited_by_the_speed_of_tools(device: Device) -> None:
+    fast = moved([0, 0.5, 0.5, 0.1], [0.1, 0.9, 0.5, 0.1], instrument={"radius": 0.005})
+    made = touching([fast], time={"step": 0.001, "duration": 0.04})
+    assert plan_of(made).stable_step > 0.01
+    study, _ = stepping_study(made, device, 0.001)
+    # Half the radius at 1.6 m/s.
+    assert max(point.step for point in study.stepping) <= 0.005 / 2 / 1.6
 
 
 def test_warnings_of_a_study(device: Device, monkeypatch: pytest.MonkeyPatch, message: Messages) -> None:

@@ -177,6 +177,13 @@ def test_interruption_of_a_sweep(many: Path, message: Messages) -> None:
     assert not Path("out/table.csv").exists()
 
 
+def test_command_with_a_shard_writes_no_table(many: Path, program: Program) -> None:
+    done = program("sweep", "many.yaml", "--shard", "2/4", "--out", "out")
+    assert done.returncode == 0
+    assert sorted(str(path.relative_to("out")) for path in Path("out").glob("*/*")) == ["runs/000001"]
+    assert [path.name for path in Path("out").glob("*.*")] == ["sweep.json"]
+
+
 def test_another_sweep_in_the_directory_is_refused(many: Path, program: Program, message: Messages) -> None:
     text = SWEEP.replace("set: {", "set: {render.camera: {eye: [0, 0, 1], calibration: camera.yml}, ")
     originals = {"many.yaml": text, "small.yaml": SMALL, "camera.yml": CALIBRATION}

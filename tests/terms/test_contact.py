@@ -110,9 +110,11 @@ def test_correction_on_axis_and_surface(precision: str, height: float, pushed: f
 PATH = PRESSED["path"]
 INVALID: dict[str, dict[str, Any]] = {
     "in the sheet": moved([0, 0.5, 0.5, -0.01]),
+    "shaft downwards": moved([0, 0.5, 0.5, 0.01], instrument={"shaft": [0, 0, -1]}),
     "jump": moved([0, 0.5, 0.5, 0.0], [0, 0.5, 0.5, 0.01]),
     "no instrument": {"path": PATH},
     "force": {**PRESSED, "total": [0, 0, -1]},
+    "keys of a force": {**PRESSED, "at": [0.5, 0.5], "total": [0, 0, -1], "radius": 0.01, "load": [[0, 100]]},
     "no path": {"total": [0, 0, -1], "friction": 0.1},
     "reversed grip": {**PRESSED, "grip": [[0.2, 0.1]]},
     "overlapping grips": {**PRESSED, "grip": [[0.1, 0.3], [0.2, 0.4]]},

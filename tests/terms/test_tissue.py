@@ -24,6 +24,7 @@ from taichi_msm.load.check import check_scene
 from taichi_msm.load.scene_file import load_scene
 from taichi_msm.model.plan import Plan
 from taichi_msm.model.sheet import Maps, rest_positions
+from taichi_msm.model.tool_force import describe_forces, probe_records
 from taichi_msm.runs.run import resume, run
 from taichi_msm.runs.simulation import Simulation
 from taichi_msm.scene.scene import Scene
@@ -226,6 +227,20 @@ def test_scenes_without_coarser_mesh(load: Any) -> None:
     assert coarser_plan(plan_of(random_scene(1))) is None
 
 
+def test_coarser_mesh_at_a_darker_part_of_the_map(load: Any, tmp_path: Path) -> None:
+    """As a scene, it would be refused for its pretension."""
+    grey = np.full((6, 7), 255, np.uint8)
+    grey[3, 3] = 0
+    Image.fromarray(grey).save(tmp_path / "map.png")
+    # A cell of the coarser sheet, of 6 x 7, is at the texel's centre; those of the sheet, of 12 x 14, a quarter of a
+    # texel away, and have 3/4 of it in both directions. The tension is just below the largest one for these.
+    largest = 1.5 * 3e4 * 2e-3 * (1 - (1 - 0.01) * (3 / 4) ** 2)
+    made = load("tissue.map={image: map.png, range: [0.01, 1]}", f"tissue.pretension={0.99 * largest}")
+    coarse: Any = coarser_plan(plan_of(made))
+    assert coarse.scene.sheet.points == (7, 8)
+    assert coarse.material.factors.min() == pytest.approx(0.01)
+
+
 @pytest.mark.slow
 def test_points_of_a_tolerance(load: Any, device: Device, tmp_path: Path) -> None:
     made = load("sheet.tolerance=0.02", *SMOOTH)
@@ -297,6 +312,7 @@ def test_warning_of_a_partial_tool(load: Any, message: Messages) -> None:
     assert not warnings()
     message(warnings("probes.0.at=[1.9, 0.5]"))
     message(warnings("probes.0={total: [0, 0, 1], falloff: 5000}"))
+    message(map(describe_forces, probe_records(load("probes.0.radius=5"))), hide=r"\d\.\d+")
 
 
 def test_resumption_with_a_map(
