@@ -2,7 +2,7 @@
 
 A companion run repeats the scene with another time step or another mesh, in parallel to the run. A coarse one, with
 half the steps, costs half a run; a fine one, with twice the steps, costs two. Hence the first companion run is coarse
-if twice the step is stable, and a fine one follows only after an error that is not negligible.
+if twice the step is stable, and a fine one follows only after an error above NEGLIGIBLE_ERROR.
 """
 
 from __future__ import annotations
@@ -11,9 +11,9 @@ import math
 from typing import NamedTuple
 
 from taichi_msm.model.plan import Plan
-from taichi_msm.solver.planning import affords_companions, stable_steps
+from taichi_msm.solver.planning import affords_companions, min_stable_steps
 
-# An error below this share of the largest displacement needs no fine companion run.
+# A smaller error, as a fraction of the largest displacement, needs no fine companion run.
 NEGLIGIBLE_ERROR = 1e-3
 
 # Largest number of steps of a fine companion run, as a multiple of the run's. The error is unknown if the damping
@@ -25,7 +25,7 @@ MAX_STEP_RATIO = 64
 # the cells per side and 1/2 of the steps.
 MESH_COST, CONTACT_MESH_COST = 1 / 4 / 2 + 1 / 16 / 4, 1 / 2 / 2
 
-# Reason for the missing time-step error of a quasi-static scene.
+# Reason for a missing estimate in a quasi-static scene, which has no time step.
 QUASISTATIC_REASON = "quasistatic"
 
 
@@ -46,14 +46,11 @@ class CompanionRuns(NamedTuple):
 
 
 def choose_companion_runs(plan: Plan, *, requested: bool = False) -> CompanionRuns:
-    """Choose the companion runs of a run.
+    """Return the companion runs of a run and their cost, or the reason for a missing estimate.
 
     Args:
         plan: plan of the run.
         requested: whether the user requests an error estimate at any cost.
-
-    Returns:
-        Companion runs and their cost, or the reason for a missing estimate.
     """
     if plan.scene.time.at_rest:
         mesh = plan.scene.tissue is not None and (requested or affords_companions(plan, MESH_COST))
@@ -62,10 +59,13 @@ def choose_companion_runs(plan: Plan, *, requested: bool = False) -> CompanionRu
     mesh_cost = (CONTACT_MESH_COST if plan.has_contact else MESH_COST) if plan.scene.tissue is not None else 0.0
     # For a run in f32, a fine companion run needs another one in f64 with the run's own steps.
     fine_cost = fine / steps + (plan.grid.precision == "f32")
-    cost = (1 + mesh_cost) * coarse / steps if coarse else fine_cost + mesh_cost
-    if coarse and plan.has_contact:
-        # The meshes are compared with the run, not with its companion.
+    if not coarse:
+        cost = fine_cost + mesh_cost
+    elif plan.has_contact:
         cost = coarse / steps + mesh_cost
+    else:
+        # Coarser meshes are compared with the coarse companion run, whose steps are longer.
+        cost = (1 + mesh_cost) * coarse / steps
     if not requested and not affords_companions(plan, cost):
         return CompanionRuns(
             reason="it would take more than two fifths of the run; to have it anyway, pass --estimate-error"
@@ -81,18 +81,16 @@ def choose_companion_runs(plan: Plan, *, requested: bool = False) -> CompanionRu
 def coarse_steps(plan: Plan) -> int:
     """Return the steps per frame of the coarse companion run, half of the run's; 0 if unstable or too expensive."""
     run_steps = plan.grid.steps_per_frame
-    steps = max(math.ceil(run_steps / 2), stable_steps(plan))
+    steps = max(math.ceil(run_steps / 2), min_stable_steps(plan))
     # A companion run with more than 0.6 of the run's steps saves too little.
     return steps if steps <= 0.6 * run_steps else 0
 
 
 def fine_steps(plan: Plan) -> int:
-    """Return the steps per frame of the fine companion run: r times the run's, with r = 2, or more in strong damping.
+    """Return the steps per frame of the fine companion run, r times the run's; 0 if r > `MAX_STEP_RATIO` is required.
 
-    r >= g h, with g = C / m. With a smaller r, central differences reverse velocities at every step, and the difference
-    between runs with steps h and h / r underestimates the error. A coarse companion run overestimates it 2 to 4 times.
-
-    The result is 0 if the damping requires r > `MAX_STEP_RATIO`.
+    r is 2, or with strong damping at least g h, with g = C / m. With a smaller r, central differences would reverse the
+    velocities at every step, and the two runs would differ by less than the error.
     """
     refinement = max(2, math.ceil(plan.material.drag * plan.grid.step))
     return refinement * plan.grid.steps_per_frame if refinement <= MAX_STEP_RATIO else 0

@@ -16,14 +16,11 @@ from taichi_msm.solver.state import RunProgress
 
 
 def tool_contact_warnings(plan: Plan, progress: RunProgress) -> Iterator[str]:
-    """Warn of tools that slide through a soft sheet, and of the first tool that pierced the sheet.
+    """Yield warnings of tools that slide through a soft sheet, and of the first tool that pierced the sheet.
 
     Args:
         plan: plan of the run.
         progress: progress of the run, with the first piercing tool.
-
-    Yields:
-        Warnings with the tool, the numbers that make its force invalid, and a remedy.
     """
     membrane, foundation = _stiffnesses(plan)
     remedy = "take friction: rough, " if plan.scene.time.at_rest else ""
@@ -49,15 +46,12 @@ def tool_contact_warnings(plan: Plan, progress: RunProgress) -> Iterator[str]:
 
 
 def first_piercing_probe(plan: Plan, displacement: NDArray[np.floating], frame: int) -> int:
-    """Find the first position-controlled tool whose axis passes through the sheet.
+    """Return the index, plus 1, of the first probe whose axis passes through the sheet; 0 if none does.
 
     Args:
         plan: plan of the run.
         displacement: displacements of the mass points [m], shape (rows, cols, 3).
         frame: number of their frame.
-
-    Returns:
-        The index of its probe plus 1, or 0 if no tool pierces the sheet.
     """
     if not plan.has_contact:
         return 0

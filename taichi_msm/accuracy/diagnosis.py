@@ -35,19 +35,16 @@ class Diagnosis:
 
 
 def diagnose(dynamics: SheetSolver[Any], start: Snapshot | None, pause: Pause) -> Diagnosis:
-    """Find the step, the mass point and the likely cause of a divergence within the current frame.
+    """Return the step, the mass point and the likely cause of a divergence within the current frame.
 
     Args:
-        dynamics: sheet that diverged; its state afterwards is arbitrary.
+        dynamics: solver that diverged; its state afterwards is arbitrary.
         start: sound state from which the run is repeated; None for the state of rest.
         pause: called several times a second; an exception from it ends the diagnosis.
-
-    Returns:
-        The message, and the last sound state.
     """
     plan, grid, bad_step = dynamics.plan, dynamics.plan.grid, dynamics.steps_done
     recorder = ForceRecorder(plan)
-    state, progress, forces = (None, RunProgress(), recorder.at_rest()) if start is None else start[:3]
+    state, progress, forces = (None, RunProgress(), recorder.at_start()) if start is None else start[:3]
     monitor = DivergenceMonitor(plan, progress)
     dynamics.restart(plan, state)
     sound, fault = dynamics.state(), ""
@@ -59,10 +56,10 @@ def diagnose(dynamics: SheetSolver[Any], start: Snapshot | None, pause: Pause) -
             break
         if monitor.progress.frame * grid.steps_per_frame == reading.steps:
             position = to_positions(reading.displacement, plan.scene.sheet)
-            forces = recorder.follow(forces, monitor.progress.frame, position, dynamics.tool_forces())
+            forces = recorder.at_frame(forces, monitor.progress.frame, position, dynamics.tool_forces())
         sound = dynamics.state()
     if not fault:
-        reason = "but not when it was repeated, so the machine has made an error; continue with --resume"
+        reason = "the repeated run does not diverge, so the machine has made an error; continue with --resume"
         return Diagnosis(divergence.format_message(grid.time(bad_step), bad_step, reason, exact=False), start)
     bad_step = dynamics.steps_done
     while bad_step - sound.steps > 1:
@@ -86,7 +83,7 @@ def _likely_cause(dynamics: SheetSolver[Any], bad_step: int, point: tuple[int, i
     """Describe the likely cause: the time step if the run with a finer one is sound, else a force or a path."""
     plan, grid = dynamics.plan, dynamics.plan.grid
     frames, finest_step = -(-bad_step // grid.steps_per_frame), math.inf
-    # Steps times mass points of all trial runs, about ten seconds; a count, for the same message on every machine.
+    # Steps times mass points of all trial runs, about ten seconds; a count gives the same message on every machine.
     budget = 5e9
     for refinement in (2, 4, 8, 16, 32, 64):
         finer = plan.with_grid(steps_per_frame=refinement * grid.steps_per_frame)

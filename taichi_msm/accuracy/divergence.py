@@ -16,15 +16,15 @@ from taichi_msm.terms import TERMS
 from taichi_msm.terms.foundation import FoundationTerm, foundation_energy, point_shares
 from taichi_msm.terms.loads import decay_norm_bound, max_free_acceleration
 
-# Factor by which the energy may exceed the energy supplied by the loads. The energy of Verlet's method oscillates by
-# 1 / (1 - (h / h_stable)^2) about the true energy, and somewhat more where springs are compressed to a point.
+# Factor by which the energy may exceed the energy supplied by the loads. The energy of Verlet's method exceeds the true
+# energy by a factor of up to 1 / (1 - (h / h_stable)^2), and somewhat more where springs are compressed to a point.
 ENERGY_OSCILLATION = 4.0
 
 
 def displacement_bound(
     plan: Plan, time: float, acceleration: float | None = None, tool_energy: float | None = None
 ) -> float:
-    """Return a bound of the displacement of a mass point in a sound run [m], infinite for some scenes.
+    """Return the largest displacement of a mass point in a sound run [m]; infinite if a foundation can accelerate it.
 
     Args:
         plan: plan of the run.
@@ -44,7 +44,7 @@ def displacement_bound(
         # Virtual springs may accelerate a distant mass point, and become inactive when it is fast.
         return math.inf
     if plan.tools:
-        # Speed of a mass point whose kinetic energy is its share of the supplied energy.
+        # Speed of the mass points if the supplied energy is kinetic and equally distributed.
         supplied = _tool_energy_bound(plan) if tool_energy is None else tool_energy
         bound += math.sqrt(2 * supplied / plan.fixed.size / plan.material.mass) * time
     return bound + (max_free_acceleration(plan) if acceleration is None else acceleration) * time * time / 2
@@ -82,10 +82,10 @@ class DivergenceMonitor:
         self._acceleration = self._tool_energy = 0.0
         self._load_norms = np.array([decay_norm_bound(slot, plan.scene) for slot in plan.slots])
         self._oscillation = ENERGY_OSCILLATION / max(1e-9, 1 - (plan.grid.step / plan.stable_step) ** 2)
-        self._relaxing = sum(share for share, _ in material.relaxation)
-        self._oscillation /= 1 - self._relaxing
+        self._relaxing_share = sum(share for share, _ in material.relaxation)
+        self._oscillation /= 1 - self._relaxing_share
         self._underflow = _underflow_energy(plan)
-        # Stiffness of the virtual springs after the last load [N/m]; 0 if they are active only under load.
+        # Stiffness of the virtual springs after the last load [N/m], shape (rows, cols); 0 if active only under load.
         lasting = material.always_active and material.virtual > 0
         self._lasting_stiffness = material.virtual * point_shares(plan) if lasting else np.zeros((1, 1))
         self.change_loads(plan)
@@ -97,7 +97,7 @@ class DivergenceMonitor:
         self._tool_energy = max(self._tool_energy, _tool_energy_bound(plan))
 
     def check_frame(self, reading: Reading) -> str:
-        """Check the next frame like `check`; record its progress if it has no fault."""
+        """Check the next frame like `check`; without a fault, record its progress."""
         extreme, progress = largest_displacement(reading.displacement), self.progress
         frame, fault = reading.steps // self._grid.steps_per_frame, self._fault(reading, extreme)
         if not fault:
@@ -170,8 +170,8 @@ class DivergenceMonitor:
         mass, virtual = material.mass, FoundationTerm.stiffness_bound(material, self._plan.scene.sheet) / 2
         forces, active, activations = self._loads.between(begin, end)
         force = float((forces * self._load_norms).sum())
-        # A power raises OverflowError where a product is infinite.
-        remembered = 4 * self._relaxing * progress.peak
+        remembered = 4 * self._relaxing_share * progress.peak
+        # Squares as products, which become infinite where a power would raise OverflowError.
         root = math.sqrt(progress.energy + remembered + active * virtual * progress.reach * progress.reach)
         root += force * (end - begin) / math.sqrt(2 * mass) + math.sqrt(self._tool_energy)
         reach = progress.reach + (end - begin) * root * math.sqrt(2 / mass)
@@ -224,7 +224,7 @@ def _release_time(plan: Plan) -> float:
 
 
 def energy_growth_warnings(plan: Plan, progress: RunProgress) -> Iterator[str]:
-    """Warn of a growth of the energy after the last load beyond its oscillation with this time step.
+    """Yield a warning if the energy grew after the last load, beyond its oscillation with this time step.
 
     The energy is measured from the position x_n and the velocity half a step before. For a mode of frequency w it is
     between 1 - w h / 2 and 1 + w h / 2 times the energy that Verlet's method conserves, where w h / 2 is at most
@@ -233,9 +233,6 @@ def energy_growth_warnings(plan: Plan, progress: RunProgress) -> Iterator[str]:
     Args:
         plan: plan of the run.
         progress: progress of the run, with the growth of the energy.
-
-    Yields:
-        A warning with the growth, the time and remedies.
 
     Source: Hairer, Lubich and Wanner 2003, Acta Numerica 12, 399-450, on the conserved energy.
     """

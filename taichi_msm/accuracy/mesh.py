@@ -48,18 +48,18 @@ from taichi_msm.scene.scene import Scene
 from taichi_msm.scene.section import MAX_POINTS
 from taichi_msm.scene.sheet import Sheet
 from taichi_msm.scene.tools import Probe
-from taichi_msm.solver.planning import choose_precision, plan_variant, stable_steps
-from taichi_msm.solver.rest import build_dynamics
+from taichi_msm.solver.planning import choose_precision, min_stable_steps, plan_variant
+from taichi_msm.solver.rest import build_solver
 from taichi_msm.system.runtime import Device
 
 # Order p of the mesh error with position-controlled tools.
 CONTACT_ORDER = 1.5
 
-# Companion runs with position-controlled tools; differences are shares of the largest displacement.
-CONTACT_CELL_RATIO = 1 / math.sqrt(2)  # cells per side of the first companion run, as a share of the run's
+# Companion runs with position-controlled tools; differences are relative to the largest displacement.
+CONTACT_CELL_RATIO = 1 / math.sqrt(2)  # cells per side of the first companion run, relative to the run
 CONTACT_ERROR_FACTOR = 1.2  # estimated error, as a multiple of the difference
 SECOND_RUN_DIFFERENCE = 0.4  # difference above which a second companion run follows
-SECOND_CELL_RATIO = 0.85  # cells per side of the second companion run, as a share of the run's
+SECOND_CELL_RATIO = 0.85  # cells per side of the second companion run, relative to the run
 SECOND_ERROR_FACTOR = 0.7  # estimated error, as a multiple of the geometric mean of both differences
 MAX_DIFFERENCE = 1.0  # largest meaningful difference from the last companion run
 MIN_RADIUS_CELLS = 0.8  # smallest meaningful radius of a tool, in cells of the run
@@ -93,7 +93,7 @@ def coarser_plan(plan: Plan, ratio: float = 0.5) -> Plan | None:
 
     Args:
         plan: plan of the scene.
-        ratio: cells per side, as a share of the plan's.
+        ratio: number of cells per side, relative to the plan.
 
     Returns:
         The plan; None without tissue, with too few mass points, or with cells beyond the largest aspect ratio.
@@ -160,7 +160,7 @@ class MeshCompanion:
 
     Args:
         plan: plan of the compared run.
-        coarse: plan of the first companion run, from `mesh_companion_plan`.
+        coarse: plan of the first companion run, from `mesh_companion_plan` or with SECOND_CELL_RATIO.
         device: device to run on.
         cores: number of CPU cores for stepping; None for all.
 
@@ -172,14 +172,15 @@ class MeshCompanion:
         self._material, steps = plan.material, plan.grid.steps_per_frame
         coarsest = None if plan.has_contact else coarser_plan(coarse)
         plans = [coarse] if coarsest is None else [coarse, coarsest]
-        self._sheets = []
+        self._solvers = []
         for companion in plans:
-            # At least half of the run's steps with contact, which limits the displacement of tools in a step.
+            # With contact, steps are limited in length, because a tool must not move too far in a step.
             min_steps = math.ceil(plan.grid.steps_per_frame / 2) if plan.has_contact else 1
-            steps = 1 if plan.scene.time.at_rest else max(math.ceil(steps / 2), stable_steps(companion), min_steps)
+            steps = 1 if plan.scene.time.at_rest else max(math.ceil(steps / 2), min_stable_steps(companion), min_steps)
             in_f64 = companion.with_grid(precision="f64", steps_per_frame=steps)
-            self._sheets.append(build_dynamics(in_f64, device, cores=cores))
+            self._solvers.append(build_solver(in_f64, device, cores=cores))
         points = zip(plan.scene.sheet.points, coarse.scene.sheet.points, strict=True)
+        # Cells of the run per cell of the first companion run, along a side.
         self._ratio = min((count - 1) / (fewer - 1) for count, fewer in points)
         self._differences = [0.0 for _ in plans]
         self._sampling_error = _sampling_force_error(plan.scene)
@@ -192,7 +193,7 @@ class MeshCompanion:
 
     def compile(self) -> None:
         """Compile the kernels before the first frame."""
-        self._sheets[0].compile()
+        self._solvers[0].compile()
 
     def compare_frame(self, displacement: NDArray[Any], pause: Pause) -> None:
         """Step to the next frame and compare it.
@@ -203,13 +204,13 @@ class MeshCompanion:
         """
         self._largest = max(self._largest, max_norm(displacement))
         finer = displacement
-        for n, sheet in enumerate(self._sheets):
+        for n, solver in enumerate(self._solvers):
             try:
-                sheet.advance(sheet.plan.grid.steps_per_frame, pause)
+                solver.advance(solver.plan.grid.steps_per_frame, pause)
             except DivergedError:  # Without an equilibrium the error is unknown.
                 self._differences[n] = math.inf
                 return
-            reading = sheet.read()
+            reading = solver.read()
             with np.errstate(all="ignore"):
                 difference = max_norm(finer - interpolate(reading.displacement, finer))
                 self._differences[n] = max(self._differences[n], difference)
@@ -218,18 +219,15 @@ class MeshCompanion:
 
     def tool_forces(self) -> NDArray[np.float64]:
         """Return the mean tool forces of the first companion run since the previous frame [N], shape (tools, 3)."""
-        return self._sheets[0].tool_forces()
+        return self._solvers[0].tool_forces()
 
     def build_second_run(self, plan: Plan, device: Device, cores: int | None = None) -> MeshCompanion | None:
-        """Build the second companion run, which begins at the first frame.
+        """Return the second companion run, which begins at the first frame; None if the first one suffices.
 
         Args:
             plan: plan of the run.
             device: device to run on.
             cores: number of CPU cores for stepping; None for all.
-
-        Returns:
-            The second companion run; None if the first one suffices.
         """
         if self._contact and not self._narrow and self._relative_difference > SECOND_RUN_DIFFERENCE:
             coarse = coarser_plan(plan, SECOND_CELL_RATIO)
@@ -238,7 +236,7 @@ class MeshCompanion:
 
     @property
     def _relative_difference(self) -> float:
-        """Largest difference of the first companion run, as a share of the largest displacement so far."""
+        """Largest difference of the first companion run, relative to the largest displacement so far."""
         return self._differences[0] / self._largest if self._largest > 0 else 0.0
 
     @property
@@ -251,18 +249,16 @@ class MeshCompanion:
             return MeshEstimate(math.inf, "the run with fewer points diverged")
         if self._contact:
             return self._contact_estimate(first / self._largest)
-        order, doubt = None, ""
+        order, doubt = 1.0, ""
         if others and first > 0:
             order = math.log(others[0] / first) / math.log(self._ratio) if others[0] > 0 else -math.inf
-        assumed_order = 1.0
-        if order is not None:
-            # An order above 2 counts as 2 minus a quarter of the excess (docs/decisions/0022).
-            assumed_order = max(1.0, min(order, 2 - (order - 2) / 4))
-        relative = first / (self._ratio**assumed_order - 1) / self._largest
-        if order is not None and not 1 <= order <= 3:
+        if not 1 <= order <= 3:
             doubt = "runs with fewer points do not converge"
         elif self._may_wrinkle:
             doubt = WRINKLING
+        # An order above 2 counts as 2 minus a quarter of the excess (docs/decisions/0022).
+        assumed_order = max(1.0, min(order, 2 - (order - 2) / 4))
+        relative = first / (self._ratio**assumed_order - 1) / self._largest
         return MeshEstimate((2 if doubt else 1) * relative + self._sampling_error, doubt)
 
     @property
@@ -300,18 +296,15 @@ def choose_points(
     check: Callable[[Scene, Maps | None], Plan],
     progress: ProgressCallback = lambda done, total: None,
 ) -> tuple[Plan, MeshEstimate]:
-    """Search for approximately the coarsest mesh whose error is within the sheet's tolerance.
+    """Return a plan with about the coarsest mesh whose error is within the sheet's tolerance, and the estimated error.
 
     The search begins with the plan's mesh, and keeps the shape of the cells.
 
     Args:
         plan: plan of a scene with a tolerance of the sheet.
         device: device for the trial runs.
-        check: function that validates and plans a scene with given maps.
+        check: function that validates a scene with given maps and builds its plan.
         progress: called with the number of finished frames of each trial run and their total.
-
-    Returns:
-        The plan with that mesh, and its estimated error.
 
     Raises:
         SceneError: when no mesh within the limits meets the tolerance, or a mesh of the search is invalid.
@@ -330,8 +323,8 @@ def choose_points(
         estimate = estimate_mesh_error(trial, device, progress)
         if estimate.error <= tolerance:
             return trial, estimate
-        # The error decreases at most with the square of the cell length. A target of 0.8 of the tolerance leads to a
-        # nearly coarsest mesh.
+        # The error decreases at most with the square of the cell length. A target of 0.8 of the tolerance leads to
+        # nearly the coarsest mesh.
         needed = refinement * math.sqrt(estimate.error / (0.8 * tolerance))
         if estimate.doubt in (NARROW_TIP, NOT_CONVERGED) and needed == math.inf:
             needed = MAX_CELL_REFINEMENT * refinement  # On a finer mesh the error is known.
@@ -349,22 +342,19 @@ def choose_points(
 
 
 def estimate_mesh_error(plan: Plan, device: Device, progress: ProgressCallback) -> MeshEstimate:
-    """Estimate the mesh error of a scene by a run and its companion runs, all in f64.
+    """Return the mesh error of a scene, estimated by a run and its companion runs, all in f64.
 
     Args:
         plan: plan of a scene with a `mesh_companion_plan`.
         device: device to run on.
         progress: called with the number of finished frames and their total.
-
-    Returns:
-        The estimate after the last frame.
     """
     in_f64, coarse, grid = plan.with_grid(precision="f64"), mesh_companion_plan(plan), plan.grid
     assert coarse is not None
     first = MeshCompanion(in_f64, coarse, device)
     companion: MeshCompanion | None = first
     while companion is not None:
-        dynamics = build_dynamics(in_f64, device)
+        dynamics = build_solver(in_f64, device)
         for frame in range(grid.frames):
             pause = partial(progress, frame, grid.frames)
             pause()
@@ -379,7 +369,7 @@ def interpolate(displacement: NDArray[Any], target: NDArray[Any]) -> NDArray[np.
 
     Args:
         displacement: displacements at the nodes of a lattice of at least 4 x 4 [m], shape (rows, cols, 3).
-        target: field of the other lattice, shape (rows, cols, 3); its values are not used.
+        target: any values at the nodes of the other lattice, shape (rows, cols, 3); only the shape matters.
 
     Returns:
         Displacements at the nodes of the other lattice [m], of the shape of `target`.

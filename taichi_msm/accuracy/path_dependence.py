@@ -25,7 +25,7 @@ from taichi_msm.model.plan import Plan
 from taichi_msm.model.tools import grip_frames
 from taichi_msm.scene.tools import Probe
 from taichi_msm.solver.planning import affords_companions, plan_variant
-from taichi_msm.solver.rest import build_dynamics
+from taichi_msm.solver.rest import build_solver
 from taichi_msm.system.runtime import Device
 from taichi_msm.terms import build_terms
 
@@ -37,11 +37,7 @@ Array = NDArray[Any]
 
 
 class PathDependence:
-    """Monitor of the path dependence of a quasi-static run.
-
-    Args:
-        plan: plan of the run.
-    """
+    """Monitor of the path dependence of a quasi-static run."""
 
     def __init__(self, plan: Plan) -> None:
         self._plan = plan
@@ -50,8 +46,8 @@ class PathDependence:
             for probe in plan.scene.probes
             if not probe.moved
         ]
-        # Number and displacements of three frames: the previous one, the one with the largest displacement, and the
-        # first one after that with less than half of it.
+        # Frames, as a pair of number and displacements: the previous one, the one with the largest displacement, and
+        # the first one after that with less than half of it.
         self._previous: tuple[int, Array] | None = None
         self._largest, self._most_displaced = 0.0, (0, np.zeros(()))
         self._unloaded: tuple[int, Array] | None = None
@@ -97,7 +93,7 @@ class PathDependence:
 
     def affords(self, companion_cost: float) -> bool:
         """Return whether second solutions and companion runs of a given cost together cost a small part of the run."""
-        # There are three second solutions. Each costs about three frames of the run, because it begins at rest.
+        # Each of the three second solutions begins at rest, and therefore costs about as much as three frames.
         second_cost = 3 * 3 / (self._plan.grid.frames + 1)
         return affords_companions(self._plan, companion_cost + second_cost)
 
@@ -153,7 +149,7 @@ def second_solution(plan: Plan, frame: int, device: Device, cores: int | None, p
         return None
     probes = tuple(_load_at_once(plan, probe, frame) for probe in scene.probes)
     time = scene.time.model_copy(update={"duration": 1.0, "frames_per_second": 1})
-    sheet = build_dynamics(
+    sheet = build_solver(
         plan_variant(plan, scene.model_copy(update={"probes": probes, "time": time})), device, cores=cores
     )
     try:

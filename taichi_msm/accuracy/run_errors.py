@@ -42,15 +42,16 @@ from taichi_msm.system.runtime import Device
 # contact (docs/decisions/0027).
 FORCE_ERROR_FACTOR = 1.15
 
-# Lower bound of the relative error of a tool's force, as a multiple of the mesh error of the displacement, for grips
-# with equal forces in both runs by chance. The upper bound is the error of the displacement (docs/decisions/0027).
-MIN_MESH_ERROR_SHARE = 0.5
+# Smallest relative error of a tool's force, as a multiple of the mesh error of the displacement, because the forces of
+# both runs may be equal by chance in a grip. The largest one, with contact, is the error of the displacement
+# (docs/decisions/0027).
+MIN_FORCE_ERROR_FACTOR = 0.5
 
 # Smallest ratio of a spring's length to its rest length for which the stability limit holds, see
 # `SpringTerm.stiffness_bound`.
 MIN_SPRING_RATIO = 0.5
 
-# Smallest error for which a remedy is suggested, as a share of the largest displacement.
+# Smallest error for which a remedy is suggested, relative to the largest displacement.
 REMEDY_THRESHOLD = 0.01
 
 
@@ -165,7 +166,7 @@ class RunErrorEstimator:
         known = self._known
         if known.time_step is None and self._time_step is not None:
             estimate = self._time_step.estimate
-            # After a coarse companion run the error may be larger; of a run in f32 the estimate is an upper bound.
+            # After a coarse companion run the error may be larger; in f32 the estimate is already an upper bound.
             if self._coarse and estimate.separate and NEGLIGIBLE_ERROR <= estimate.error < math.inf:
                 estimate = replace(estimate, at_least=True)
             known = known._replace(time_step=estimate)
@@ -191,7 +192,7 @@ class RunErrorEstimator:
         relative = float(root_mean_square / self._max_force.max())
         if relative > FORCE_ERROR_FACTOR * MAX_DIFFERENCE:
             return ForceEstimate(None, NOT_CONVERGED)
-        relative = max(relative, MIN_MESH_ERROR_SHARE * mesh.error)
+        relative = max(relative, MIN_FORCE_ERROR_FACTOR * mesh.error)
         if not self._plan.has_contact:
             return ForceEstimate(relative)
         displacement_error = max(mesh.error, known.time_step.error if known.time_step is not None else 0.0)
@@ -206,31 +207,28 @@ def run_warnings(
     affords: Callable[[Plan], bool] = lambda plan: True,
     scale: float | None = None,
 ) -> Iterator[str]:
-    """Format the error estimates and warnings of a run up to its last frame.
+    """Yield the error estimates and warnings of a run up to its last frame, a line of text each.
 
     Args:
         plan: plan of the run.
         probes: records of the probes' forces.
         progress: progress of the run.
         errors: estimated errors of the run.
-        affords: function from a plan to whether it runs within an hour.
+        affords: function that returns whether a plan runs within an hour.
         scale: pixels per metre at the middle of the sheet; None without a picture.
-
-    Yields:
-        A line of text per estimate or warning.
     """
     scene, grid = plan.scene, plan.grid
-    estimate, reason, mesh, force = errors
-    if estimate is not None or mesh is not None:
-        yield _error_line(estimate, mesh, progress.max_displacement, scale) + (
+    time_step, reason, mesh, force = errors
+    if time_step is not None or mesh is not None:
+        yield _error_line(time_step, mesh, progress.max_displacement, scale) + (
             "; mesh error unknown: another number of points is another sheet" if scene.tissue is None else ""
         )
-    if estimate is not None:
-        if REMEDY_THRESHOLD < estimate.error < math.inf and not estimate.separate:
+    if time_step is not None:
+        if REMEDY_THRESHOLD < time_step.error < math.inf and not time_step.separate:
             yield "--estimate-error separates the errors of the time step and of rounding"
-        elif REMEDY_THRESHOLD < estimate.error < math.inf:
-            source = "the time step" if estimate.in_f64 > REMEDY_THRESHOLD / 2 else "rounding"
-            yield f"for a smaller error of {source}, {_step_remedy(plan, estimate, affords)}"
+        elif REMEDY_THRESHOLD < time_step.error < math.inf:
+            source = "the time step" if time_step.in_f64 > REMEDY_THRESHOLD / 2 else "rounding"
+            yield f"for a smaller error of {source}, {_step_remedy(plan, time_step, affords)}"
     elif reason == QUASISTATIC_REASON:
         yield "error: no time step in a quasi-static scene"
     elif reason:
@@ -284,7 +282,7 @@ def _error_line(
     """Format the estimated errors of a run; for the arguments see `run_warnings`."""
     if estimate is not None and estimate.error == math.inf:
         return "error not known: a companion run diverged, or steps do not resolve the damping"
-    parts, errors = [], [mesh.error] if mesh is not None and mesh.error < math.inf else []
+    parts, errors, sentences = [], [], []
     if estimate is not None:
         bound = _bound_words(estimate.at_most or not estimate.separate, estimate.at_least)
         name = "time step" if estimate.separate else "time step and rounding"
@@ -294,13 +292,15 @@ def _error_line(
         errors.append(estimate.error)
     if mesh is not None and mesh.error < math.inf:
         parts.append(f"mesh {_bound_words(mesh.at_most, bool(mesh.doubt))}{_percent(mesh.error, 2)} %")
-    of = ""
+        errors.append(mesh.error)
     if errors:
         distance = max(errors) * max_displacement
         pixels = f", {_digits(distance * scale)} px" if scale is not None else ""
-        of = f" of {_digits(1000 * max_displacement, 2)} mm ({_digits(1000 * distance)} mm{pixels})"
-    unknown = f"; mesh error not known: {mesh.doubt}" if mesh is not None and mesh.error == math.inf else ""
-    return f"error: {', '.join(parts)}{of}{unknown}" if parts else f"error{unknown}".replace("error; ", "")
+        size = f"{_digits(1000 * max_displacement, 2)} mm ({_digits(1000 * distance)} mm{pixels})"
+        sentences.append(f"error: {', '.join(parts)} of {size}")
+    if mesh is not None and mesh.error == math.inf:
+        sentences.append(f"mesh error not known: {mesh.doubt}")
+    return "; ".join(sentences)
 
 
 def _bound_words(at_most: bool, at_least: bool) -> str:
@@ -308,8 +308,8 @@ def _bound_words(at_most: bool, at_least: bool) -> str:
     return ("roughly " if at_least else "at most about ") if at_most else "at least " if at_least else ""
 
 
-def _percent(share: float, digits: int) -> str:
-    return _digits(100 * share, digits)
+def _percent(fraction: float, digits: int) -> str:
+    return _digits(100 * fraction, digits)
 
 
 def _digits(number: float, digits: int = 1) -> str:

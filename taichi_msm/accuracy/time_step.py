@@ -34,16 +34,16 @@ from taichi_msm.scene.section import MAX_TOLERANCE
 from taichi_msm.solver.dynamics import Dynamics
 from taichi_msm.system.runtime import Device
 
-# Smallest error at which the search ends, as a share of the tolerance; the step is then about 90 % of the largest
-# possible one, or more.
-MIN_TOLERANCE_SHARE = 0.75
+# The search ends at an error between this fraction of the tolerance and the tolerance; the step is then at least about
+# 90 % of the largest possible one.
+MIN_TOLERANCE_FRACTION = 0.75
 
 # Safety factor of an error estimated by a coarse companion run, because kinks of a load have other positions in its
 # steps (docs/decisions/0021).
 COARSE_MARGIN = 1.25
 
-# With contact, the error estimated by a fine companion run at order 1 has the safety factor CONTACT_MARGIN. The coarse
-# companion run changes it by at most the share COARSE_INFLUENCE (docs/decisions/0027).
+# With contact, an error estimated by a fine companion run has the additional safety factor CONTACT_MARGIN. The estimate
+# of the coarse companion run changes it by at most the factor 1 +- COARSE_INFLUENCE (docs/decisions/0027).
 CONTACT_MARGIN, COARSE_INFLUENCE = 1.5, 1 / 3
 
 # Largest refinement of the step from one trial run of a search to the next.
@@ -55,15 +55,15 @@ class TimeStepEstimate:
     """Estimated error of the time step and of rounding, as fractions of the largest displacement."""
 
     steps_per_frame: int  # steps per frame of the run
-    # Largest error; infinite if unknown, because a companion run diverged or the step does not resolve the damping.
+    # Largest error; infinite if unknown because a companion run diverged or the step does not resolve the damping.
     error: float
     rounding: float  # part of the error that comes from f32, including positions in the trajectory; 0 in f64
     in_f64: float  # error of the same step in f64
     order: int  # of the method in this scene
-    # Whether `rounding` and `in_f64` are known separately; else, after a coarse companion run in f32, both are bounds.
+    # Whether `rounding` and `in_f64` are separate; else, after a coarse companion of a run in f32, both equal `error`.
     separate: bool = True
-    # Whether the error may be larger: after a coarse companion run that requires a fine one, in contact if the error
-    # does not decrease with the step, or above the largest error that can be estimated.
+    # Whether the error may be larger, because a fine companion run is missing; with contact, because tools overlap, the
+    # error does not decrease with the step, or it is above the largest tolerance.
     at_least: bool = False
     at_most: bool = False  # whether the error may be much smaller, because of contact
 
@@ -71,15 +71,12 @@ class TimeStepEstimate:
 def choose_step(
     plan: Plan, device: Device, progress: ProgressCallback = lambda done, total: None
 ) -> tuple[Plan, TimeStepEstimate]:
-    """Search for the largest stable step whose estimated error is within the scene's tolerance.
+    """Return a plan with the largest stable step whose error is within the scene's tolerance, and the estimated error.
 
     Args:
         plan: plan with a tolerance, and with the smallest number of steps per frame of the search.
         device: device for the trial runs.
         progress: called with the number of finished frames of each trial run and their total.
-
-    Returns:
-        The plan with that step, and its estimated error.
 
     Raises:
         SceneError: when no step meets the tolerance; suggests a precision or a tolerance.
@@ -94,9 +91,9 @@ def choose_step(
         else:
             too_few = steps
             failures.append(trial)
-            if trial.rounding > MIN_TOLERANCE_SHARE * tolerance or _stagnates(failures):
+            if trial.rounding > MIN_TOLERANCE_FRACTION * tolerance or _stagnates(failures):
                 break
-        if best and (best.error >= MIN_TOLERANCE_SHARE * tolerance or best.steps_per_frame - too_few <= 1):
+        if best and (best.error >= MIN_TOLERANCE_FRACTION * tolerance or best.steps_per_frame - too_few <= 1):
             break
         steps = max(_next_steps(trial, tolerance), too_few + 1)
         if best and steps >= best.steps_per_frame:
@@ -109,15 +106,15 @@ def choose_step(
 class TimeStepCompanion:
     """Companion run in f64 with another time step, compared with a run frame by frame.
 
-    A fine companion of a run in f32 includes a second run in f64 with the run's own steps, which separates the
-    rounding. A coarse companion is cheap and has none: its estimate is the difference of the two runs, rounding plus
-    r^-p - 1 times the error of the step. A factor r^-p - 1 below `COARSE_MARGIN` is raised to it.
+    For a run in f32, a fine companion includes a second run in f64 with the run's own steps, which separates the
+    rounding. A coarse companion has none. The difference of the two runs then contains the rounding, plus r^-p - 1
+    times the error of the step. It is the estimate, scaled up if r^-p - 1 is smaller than `COARSE_MARGIN`.
 
     Args:
         plan: plan of the run.
         steps: steps per frame of the companion run; 0 if the error cannot be estimated.
         device: device to run on.
-        cores: number of CPU cores for stepping; None for all. The number of the run reuses its kernels.
+        cores: number of CPU cores for stepping; None for all. The kernels of a run with the same number are reused.
 
     Attributes:
         displacement: displacements of the companion run at the last frame [m], shape (rows, cols, 3).
@@ -131,14 +128,15 @@ class TimeStepCompanion:
         coarse = 0 < steps < plan.grid.steps_per_frame
         self._separate = plan.grid.precision == "f64" or not coarse
         self._dynamics = Dynamics(in_f64, device, cores=cores)
-        # A run in f64 serves as the second run; a coarse companion has none.
+        # A run in f64 serves as the second run.
         needs_same_step = plan.grid.precision != "f64" and not coarse
         self._same_step = Dynamics(in_f64, device, cores=cores) if needs_same_step else None
-        self._margin = COARSE_MARGIN * CONTACT_MARGIN if plan.has_contact else 1.0
-        self._overlap = overlap(plan.tools, plan.scene.time.duration) is not None
         if coarse:
             factor = (plan.grid.steps_per_frame / steps) ** self._order - 1
             self._margin = COARSE_MARGIN if self._separate else max(1.0, COARSE_MARGIN / factor)
+        else:
+            self._margin = COARSE_MARGIN * CONTACT_MARGIN if plan.has_contact else 1.0
+        self._overlap = overlap(plan.tools, plan.scene.time.duration) is not None
         self.restart(plan, steps)
 
     def restart(self, plan: Plan, steps: int) -> None:
@@ -188,7 +186,7 @@ class TimeStepCompanion:
                 self._rounding = max(self._rounding, max_norm(displacement - same_step))
 
     def force_error(self, forces: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the error, of order 1, of the mean tool forces since the previous frame [N], shape (tools, 3)."""
+        """Estimate the error of the mean tool forces since the previous frame [N], shape (tools, 3), with order 1."""
         ratio = self._steps / self._plan.grid.steps_per_frame
         return np.asarray(self._margin * abs(ratio / (ratio - 1)) * np.abs(forces - self._dynamics.tool_forces()))
 
@@ -201,8 +199,8 @@ class TimeStepCompanion:
 
         def relative(distance: float) -> float:
             # A sheet at rest has no error; a non-finite error is unknown.
-            share = self._margin * distance / self._largest if self._largest > 0 else 0.0
-            return share if share < math.inf and self._largest <= bound else math.inf
+            fraction = self._margin * distance / self._largest if self._largest > 0 else 0.0
+            return fraction if fraction < math.inf and self._largest <= bound else math.inf
 
         error, rounding, in_f64 = (relative(each) for each in (self._error, self._rounding, self._in_f64))
         if not self._same_step:
@@ -220,14 +218,14 @@ def combine_estimates(coarse: TimeStepEstimate, fine: TimeStepEstimate) -> TimeS
         fine: estimate of the fine companion run.
 
     Returns:
-        The fine estimate; with contact, scaled toward the coarse one by at most the share `COARSE_INFLUENCE`.
+        The fine estimate; with contact, scaled toward the coarse one by at most the factor 1 +- `COARSE_INFLUENCE`.
     """
     if not fine.at_most or fine.error in (0, math.inf):
         return fine
-    share = min(max(coarse.error / fine.error, 1 - COARSE_INFLUENCE), 1 + COARSE_INFLUENCE)
-    # The difference of the fine companion run, without the margins, is larger than that of the coarse one.
+    factor = min(max(coarse.error / fine.error, 1 - COARSE_INFLUENCE), 1 + COARSE_INFLUENCE)
+    # Without margins and extrapolation, the fine companion run differs more from the run than the coarse one does.
     grows = fine.error > 2 * CONTACT_MARGIN * coarse.error
-    return replace(fine, error=share * fine.error, in_f64=share * fine.in_f64, at_least=fine.at_least or grows)
+    return replace(fine, error=factor * fine.error, in_f64=factor * fine.in_f64, at_least=fine.at_least or grows)
 
 
 class TimeStepTrials:
@@ -244,14 +242,11 @@ class TimeStepTrials:
         self._dynamics = Dynamics(plan, device)
 
     def estimate(self, steps: int, progress: ProgressCallback = lambda done, total: None) -> TimeStepEstimate:
-        """Run the scene with a number of steps per frame, and estimate its error.
+        """Return the error with a number of steps per frame, estimated by a run.
 
         Args:
             steps: steps per frame.
             progress: called with the number of finished frames and their total.
-
-        Returns:
-            The estimated error with these steps.
         """
         plan = self._plan.with_grid(steps_per_frame=steps)
         fine, frames = fine_steps(plan), plan.grid.frames
@@ -265,7 +260,7 @@ class TimeStepTrials:
         return self._companion.estimate
 
     def _as_stored(self, displacement: NDArray[Any]) -> NDArray[Any]:
-        """Round displacements like positions of a trajectory in f32, in which the size of the sheet costs digits."""
+        """Round displacements like the positions of a trajectory in f32, which lose digits to the size of the sheet."""
         if "trajectory" not in self._plan.scene.output or self._plan.grid.precision == "f64":
             return displacement
         rest = rest_positions(self._plan.scene.sheet)
@@ -286,12 +281,12 @@ def _rounded_up(error: float) -> float:
 
 
 def _next_steps(trial: TimeStepEstimate, tolerance: float) -> int:
-    """Extrapolate the smallest sufficient number of steps per frame by the order of the method."""
+    """Extrapolate the number of steps per frame that meets the tolerance, by the order of the method."""
     if trial.error == math.inf:
         refinement = MAX_STEP_REFINEMENT
     else:
         # Allowed and estimated error of the step, both without the rounding.
-        allowed = max((1 + MIN_TOLERANCE_SHARE) / 2 * tolerance - trial.rounding, tolerance / 16)
+        allowed = max((1 + MIN_TOLERANCE_FRACTION) / 2 * tolerance - trial.rounding, tolerance / 16)
         error = max(trial.error - trial.rounding, 0.0)
         refinement = min((error / allowed) ** (1 / trial.order), MAX_STEP_REFINEMENT)
     return max(1, math.ceil(trial.steps_per_frame * refinement))
@@ -315,7 +310,7 @@ def _out_of_reach(tolerance: float, failures: list[TimeStepEstimate]) -> str:
             f"time.tolerance: {tolerance:g} is out of reach: with {last.steps_per_frame} steps a frame the error is "
             "not known, as runs diverge or steps do not resolve the damping; take a weaker load or less damping"
         )
-    if last.rounding > MIN_TOLERANCE_SHARE * tolerance:
+    if last.rounding > MIN_TOLERANCE_FRACTION * tolerance:
         return (
             f"time.tolerance: {tolerance:g} is out of reach of f32, whose rounding alone causes an error of "
             f"{last.rounding:.2g} here; take time.precision: f64, or a tolerance of {_rounded_up(4 * last.rounding):g}"

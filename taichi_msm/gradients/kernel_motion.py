@@ -22,7 +22,7 @@ from functools import cache
 from typing import Any, NamedTuple
 
 from taichi_msm.solver.arrays import build_point_step
-from taichi_msm.solver.bands import MOMENT_ROWS, build_join_strips
+from taichi_msm.solver.bands import MOMENT_ROWS, build_fill_halo
 from taichi_msm.solver.row import build_pass_row
 from taichi_msm.system.runtime import ITERATIONS_PER_THREAD, ti
 from taichi_msm.terms.base import AREA_SHARE, DX, DY, GAIN, MOBILITY, Entry, KernelConfig, KernelRow, KernelSheet
@@ -154,7 +154,7 @@ def _build_store_moments(code: KernelConfig) -> list[Callable[..., None]]:
 
     The first row of a band needs the moments of three rows; each further row adds one.
     """
-    bending, join_strips = code.get(BendingTerm), build_join_strips(code)
+    bending, fill_halo = code.get(BendingTerm), build_fill_halo(code)
     if bending is None:
         return []
     store_moment = bending.build_store_moment(code)
@@ -168,7 +168,7 @@ def _build_store_moments(code: KernelConfig) -> list[Callable[..., None]]:
             target = band.moments + (ahead + MOMENT_ROWS) % MOMENT_ROWS
             for b in range(1, sheet.width - 1):
                 store_moment(sheet, ahead, above, row, below, b, target)
-            join_strips(sheet.u, target, sheet.width)
+            fill_halo(sheet.u, target, sheet.width)
 
     return [store_moments]
 
@@ -185,7 +185,7 @@ def build_store(code: KernelConfig, *, parallel: bool) -> Callable[..., None]:
         The kernel `store`.
     """
     real, vector, vectors = code.real, code.vector, code.vectors
-    count_of_numbers, join_strips, step = code.first_constant(None), build_join_strips(code), build_point_step(code)
+    count_of_numbers, fill_halo, step = code.first_constant(None), build_fill_halo(code), build_point_step(code)
     storing = _build_store_moments(code)
 
     @ti.func
@@ -218,7 +218,7 @@ def build_store(code: KernelConfig, *, parallel: bool) -> Callable[..., None]:
             up = 0 - sheet.constants[DY]
             pass_row(sheet, sheet.u, carry, line, u_row + i, below, exists, up, loads, k, i >= low)
             if i >= low:
-                join_strips(sheet.u, u_row + sheet.rows + i, sheet.width)
+                fill_halo(sheet.u, u_row + sheet.rows + i, sheet.width)
 
     run_worker = _build_run_worker(step_band, parallel=parallel)
 
@@ -411,7 +411,7 @@ def build_sweep(code: KernelConfig, *, parallel: bool) -> Callable[..., None]:
         The kernel `sweep`.
     """
     real, vector, vectors, count_of_numbers = code.real, code.vector, code.vectors, code.first_constant(None)
-    join_strips, storing = build_join_strips(code), _build_store_moments(code)
+    fill_halo, storing = build_fill_halo(code), _build_store_moments(code)
     sweep_row = _build_sweep_row(code)
 
     @ti.func
@@ -436,7 +436,7 @@ def build_sweep(code: KernelConfig, *, parallel: bool) -> Callable[..., None]:
                     store_moments(sheet, band, i)
             sweep_row(sheet, band, i, tables.loads, tables.by_load)
             if i >= low:
-                join_strips(sheet.u, target + i, sheet.width)
+                fill_halo(sheet.u, target + i, sheet.width)
 
     run_worker = _build_run_worker(step_band, parallel=parallel)
 

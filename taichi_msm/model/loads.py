@@ -35,7 +35,7 @@ class Schedule(NamedTuple):
     slots: tuple[ProbeSlot, ...]  # the second axis of `strength` and `point`
     strength: Array  # force without decay [N], shape (steps, slots, 3)
     point: Array  # control point, x and y at rest [m], shape (steps, slots, 2)
-    active: Array  # active share of the virtual springs' stiffness, 0 to 1, shape (steps,)
+    active: Array  # factor of the virtual springs' stiffness, 0 to 1, shape (steps,)
 
 
 def decay(probe: Probe, sheet: Sheet, at: Array | None = None) -> Array:
@@ -73,15 +73,12 @@ def decay_gradient(probe: Probe, sheet: Sheet, at: Array | None = None) -> Array
 
 
 def average_loads(plan: Plan, first: int, count: int) -> Schedule:
-    """Average the loads with the hat function of each step.
+    """Return the loads of consecutive steps, averaged with the hat function of each step.
 
     Args:
         plan: supplies the probes, their slots and the step.
         first: number of the first step.
         count: number of consecutive steps.
-
-    Returns:
-        Loads of the steps first, ..., first + count - 1.
     """
     scene, slots = plan.scene, plan.slots
     t, h = np.arange(first, first + count) / plan.grid.steps_per_second, plan.grid.step
@@ -158,7 +155,7 @@ class FrameLoad:
 
 
 def evaluate_frame_loads(plan: Plan, frame: int) -> Schedule:
-    """Evaluate the loads at a frame, as a schedule of one step.
+    """Return the loads at a frame, as a schedule of one step with one slot per probe.
 
     At a jump the loads are those after it. A keyframe within FRAME_TOLERANCE frames counts as at the frame. A
     foundation with `foundation_active: loaded` is active if any load differs from 0, or if any path has begun and not
@@ -167,9 +164,6 @@ def evaluate_frame_loads(plan: Plan, frame: int) -> Schedule:
     Args:
         plan: supplies the probes and the frame rate.
         frame: number of the frame.
-
-    Returns:
-        Loads of one step, with one slot per probe.
     """
     scene, rate = plan.scene, plan.grid.frames_per_second
     time = frame / rate
@@ -194,11 +188,7 @@ def _all_key_times(scene: Scene) -> Array:
 
 
 class LoadBounds:
-    """Bounds of the loads over time intervals.
-
-    Args:
-        plan: supplies the probes, their slots and the step.
-    """
+    """Bounds of the loads of a plan over time intervals."""
 
     def __init__(self, plan: Plan) -> None:
         scene, self._h = plan.scene, plan.grid.step
@@ -241,7 +231,7 @@ class _PiecewiseLinear:
         # Limits from the left and from the right at every keyframe.
         before, after = values[times.searchsorted(keys, "left")], values[times.searchsorted(keys, "right") - 1]
         before[0] = 0.0
-        # Redundant keyframes are dropped, because they would change the rounding.
+        # Drop redundant keyframes, because they would change the rounding.
         last, following = np.append(0.0, after[:-1]), np.append(before[1:], after[-1])
         needed = (last != before) | (before != after) | (after != following)
         needed[0] = True
@@ -279,9 +269,9 @@ class _PiecewiseLinear:
         """Evaluate the function between the keyframes after[n] - 1 and after[n]."""
         low, high = np.maximum(after - 1, 0), np.minimum(after, len(self.times) - 1)
         span = self.times[high] - self.times[low]
-        share = np.divide(t - self.times[low], span, out=np.zeros_like(t), where=span > 0)
+        fraction = np.divide(t - self.times[low], span, out=np.zeros_like(t), where=span > 0)
         slope = np.where(span > 0, self.before[high] - self.after[low], 0.0)
-        return np.where(after == 0, 0.0, self.after[low] + share * slope)
+        return np.where(after == 0, 0.0, self.after[low] + fraction * slope)
 
     def _average(self, t: float, h: float, begin: float, end: float) -> float:
         """Return the average about a time, by Simpson's rule on each piece; exact for products of linear functions."""
@@ -327,7 +317,7 @@ def _load(probe: Probe) -> _PiecewiseLinear:
 
 
 def _pressing_keys(probe: Probe) -> Sequence[tuple[float, float]]:
-    """Return keyframes of a function that is nonzero while a probe acts: its load, or 1 along its path."""
+    """Return the keyframes of a function that is not 0 while a probe acts: its load, or 1 along its path."""
     if probe.path is None:
         return probe.load
     begin, end = probe.path[0][0], probe.path[-1][0]

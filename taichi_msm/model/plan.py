@@ -42,8 +42,6 @@ class ProbeSlot:
 
     probe: int  # index of the probe in the scene
     segments: tuple[ProbeSegment, ...]  # all segments of the control point, including those of other slots
-    first_segment: int  # index of the slot's first segment
-    slot_count: int  # number of slots of the probe; the slot has the segments first_segment + n slot_count, n >= 0
 
     @property
     def moves(self) -> bool:
@@ -57,15 +55,12 @@ class ProbeSlot:
 
 
 def probe_slots(probes: Sequence[Probe], sheet: Sheet, h: float) -> tuple[ProbeSlot, ...]:
-    """Build the slots of all force-controlled probes.
+    """Return the slots of all force-controlled probes, in the order of the probes.
 
     Args:
         probes: all probes of a scene; position-controlled tools have no slots.
         sheet: supplies the size that converts `probe.at` to metres.
         h: half-width of the hat, equal to the time step [s]; 0 for loads without averages, with one slot per probe.
-
-    Returns:
-        Slots in the order of the probes.
     """
     slots = []
     for index, probe in enumerate(probes):
@@ -77,20 +72,16 @@ def probe_slots(probes: Sequence[Probe], sheet: Sheet, h: float) -> tuple[ProbeS
         jump_times = times[jumps]
         hat_ends = jump_times + 2 * h * (1 - HAT_TOLERANCE)
         jumps_in_hat = np.searchsorted(jump_times, hat_ends, "left") - np.arange(len(jump_times))
-        slot_count = 1 + int(jumps_in_hat.max(initial=0))
-        slots += [ProbeSlot(index, segments, first, slot_count) for first in range(slot_count)]
+        slots += [ProbeSlot(index, segments)] * (1 + int(jumps_in_hat.max(initial=0)))
     return tuple(slots)
 
 
 def build_slots(scene: Scene, grid: TimeGrid) -> tuple[ProbeSlot, ...]:
-    """Build the slots of a scene's probes, one per probe in a quasi-static scene.
+    """Return the slots of a scene's probes, in their order, one per probe in a quasi-static scene.
 
     Args:
         scene: supplies the probes and the kind of motion.
         grid: supplies the step, the half-width of the hat.
-
-    Returns:
-        Slots in the order of the probes.
     """
     return probe_slots(scene.probes, scene.sheet, 0.0 if scene.time.at_rest else grid.step)
 
@@ -132,10 +123,7 @@ class Plan:
         return replace(self, grid=grid, slots=build_slots(self.scene, grid))
 
     def with_probes(self, probes: Sequence[Probe | Mapping[str, Any]]) -> Plan:
-        """Return a copy with other probes.
-
-        Args:
-            probes: all probes, each a `Probe` or a mapping of its keys.
+        """Return a copy with other probes, each a `Probe` or a mapping of its keys.
 
         Raises:
             SceneError: when a mapping is not a valid probe.

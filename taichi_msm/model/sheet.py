@@ -75,7 +75,7 @@ def fixed_sides(sheet: Sheet) -> tuple[Side, ...]:
 
 
 def _held_points(scene: Scene, fixed: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """Return whether each mass point is fixed or clamped, both of shape (rows, cols)."""
+    """Return whether each mass point is fixed or clamped, shape (rows, cols)."""
     held = fixed.copy()
     for probe in scene.probes:
         if probe.clamp is not None:
@@ -99,11 +99,6 @@ class LockNumbers(NamedTuple):
 
     lock: float  # elongation m at which the law locks: strain of a spring, or depth of the foundation [m]
     factor: float  # largest tangent stiffness, relative to the initial one
-
-    @property
-    def steepest(self) -> float:
-        """Largest tangent stiffness, relative to the initial one, for the stability limit."""
-        return self.factor
 
 
 @dataclass(frozen=True, eq=False)
@@ -168,16 +163,13 @@ def point_factors(stiffness_map: StiffnessMap, image: MapImage, sheet: Sheet) ->
 
 
 def map_factors(stiffness_map: StiffnessMap, image: MapImage, rows: Array, cols: Array) -> Array:
-    """Interpolate the factors of a stiffness map bilinearly between pixel centres; constant beyond the outermost ones.
+    """Return the factors of a stiffness map, bilinear between pixel centres, constant beyond them, shape (m, n).
 
     Args:
         stiffness_map: supplies the factors of black and white.
         image: image of the map.
         rows: distances of the sampled rows from the top, as fractions of the height, shape (m,).
         cols: distances of the sampled columns from the left, as fractions of the width, shape (n,).
-
-    Returns:
-        Factors, shape (m, n).
     """
     grey = image.grey.astype(float)
     height, width = grey.shape
@@ -248,15 +240,12 @@ def material_key_problems(scene: Scene) -> Iterator[Problem]:
 
 
 def tissue_problems(scene: Scene, fixed: NDArray[np.bool_], factors: Array | None) -> Iterator[Problem]:
-    """Report impossible values of keys of tissue.
+    """Yield problems of impossible values of keys of tissue.
 
     Args:
         scene: scene for which `material_key_problems` yields nothing.
         fixed: whether each mass point is fixed, shape (rows, cols).
         factors: stiffness factors of the cells, shape (rows - 1, cols - 1); None without a readable map.
-
-    Yields:
-        Problems with the key, its value and a remedy.
     """
     tissue, sheet = scene.tissue, scene.sheet
     if tissue is None:

@@ -91,8 +91,8 @@ def surface_weights(coordinates: Array, sheet: Sheet, refine: int) -> tuple[NDAr
 def _interpolate(position: NDArray[np.floating], refine: int, coordinates: Array) -> tuple[Array, Array]:
     """Return points of the surface and its normals, not normalised, both of shape (n, 3)."""
     rows, cols = position.shape[:2]
-    i, j, *shares = _cell_coordinates(coordinates, (rows, cols), refine)
-    s, t, twist = (share[:, None] for share in shares)
+    i, j, *in_cell = _cell_coordinates(coordinates, (rows, cols), refine)
+    s, t, twist = (values[:, None] for values in in_cell)
     a, right, below, opposite = (position[i + n // 2, j + n % 2].astype(np.float64) for n in range(4))
     b, c, d = right - a, below - a, opposite - right - below + a
     return a + b * s + c * t + d * twist, np.cross(b + d * t, -(c + d * s))
@@ -107,7 +107,7 @@ def _cell_coordinates(coordinates: Array, points: tuple[int, int], refine: int) 
     s, t = (coordinates * (cols - 1, rows - 1)).T
     j, i = np.minimum(s.astype(int), cols - 2), np.minimum(t.astype(int), rows - 2)
     s, t = s - j, t - i
-    s0, t0 = (np.minimum((share * quads).astype(int), quads - 1) / quads for share in (s, t))
+    s0, t0 = (np.minimum((each * quads).astype(int), quads - 1) / quads for each in (s, t))
     s1, t1 = s - s0, t - t0
     return i, j, s, t, s0 * t0 + s1 * t0 + s0 * t1 + np.minimum(s1, t1) / quads
 
@@ -121,26 +121,23 @@ class Surface(NamedTuple):
 
 
 class Solid(NamedTuple):
-    """An instrument at a time: its shape and position."""
+    """The shape and position of an instrument at a time."""
 
     tip: Array  # end of the axis at the sheet [m], shape (3,)
     axis: Array  # unit vector from the tip along the shaft, shape (3,)
     length: float  # of the axis [m]
     radius: float  # of the shape [m]
-    shape: Shape = SHAPES["capsule"]
+    shape: Shape
 
 
 def refine_surface(position: NDArray[np.floating], refine: int) -> Surface:
-    """Refine the sheet bilinearly (section 2 of the paper) and triangulate it.
+    """Return the triangles of the sheet after bilinear refinement (section 2 of the paper).
 
     Every small quad is divided by the diagonal from top left to bottom right.
 
     Args:
         position: positions of the mass points [m], shape (rows, cols, 3).
         refine: number of vertices inserted between neighbouring mass points.
-
-    Returns:
-        Textured triangles.
     """
     vertices = _insert(_insert(position, refine, 0), refine, 1)
     rows, cols = vertices.shape[:2]
@@ -202,6 +199,6 @@ def _insert(values: NDArray[np.floating], refine: int, axis: int) -> NDArray[np.
     """Insert interpolated values between neighbours along an axis; the given values keep their bits."""
     intervals = refine + 1
     along = np.moveaxis(values, axis, 0)
-    share = np.arange(intervals, dtype=values.dtype).reshape(-1, *(1,) * (along.ndim - 1)) / intervals
-    filled = along[:-1, None] + share * (along[1:] - along[:-1])[:, None]
+    fraction = np.arange(intervals, dtype=values.dtype).reshape(-1, *(1,) * (along.ndim - 1)) / intervals
+    filled = along[:-1, None] + fraction * (along[1:] - along[:-1])[:, None]
     return np.moveaxis(np.concatenate([filled.reshape(-1, *along.shape[1:]), along[-1:]]), 0, axis)

@@ -63,9 +63,9 @@ def probe_force(probe: Probe, sheet: Sheet) -> ProbeForce:
         assert probe.force is not None
         return ProbeForce(probe.force, probe.falloff, probe.offset - rim, probe.offset, by_area=False)
     dx, dy = spacing(sheet)
-    share = dx * dy / _decay_integral(probe)
+    fraction = dx * dy / _decay_integral(probe)
     x, y, z = probe.total
-    return ProbeForce((x * share, y * share, z * share), probe.falloff, 0.0 - rim, 0.0, by_area=True)
+    return ProbeForce((x * fraction, y * fraction, z * fraction), probe.falloff, 0.0 - rim, 0.0, by_area=True)
 
 
 def control_points(probe: Probe, sheet: Sheet) -> tuple[Array, Array]:
@@ -101,12 +101,12 @@ def point_at(times: Array, points: Array, time: float) -> Array:
         points: control points at the keyframes [m], shape (n, 2).
         time: time [s].
     """
-    # A keyframe within the rounding error of a frame's time counts as reached.
+    # A keyframe later than the time by a rounding error counts as reached.
     after = int(np.searchsorted(times, time + 1e-12 * max(1.0, abs(time)), side="right"))
     if after in (0, len(times)):
         return points[min(after, len(times) - 1)]
-    share = min(1.0, (time - times[after - 1]) / (times[after] - times[after - 1]))
-    return points[after - 1] + share * (points[after] - points[after - 1])
+    fraction = min(1.0, (time - times[after - 1]) / (times[after] - times[after - 1]))
+    return points[after - 1] + fraction * (points[after] - points[after - 1])
 
 
 def _decay_integral(probe: Probe) -> float:
@@ -138,9 +138,9 @@ def sum_probe_forces(probe: Probe, sheet: Sheet, refinement: int = 1) -> tuple[f
     for first in range(0, rows + 1, block):
         rows_of_block = slice(first, first + block)
         decay = law.decay(np.hypot(x - at_x, y[rows_of_block, None] - at_y))
-        share = down[rows_of_block, None] * along
-        total += float((decay * share if law.by_area else decay).sum())
-        largest = max(largest, float((decay if law.by_area else decay / share).max()))
+        area_share = down[rows_of_block, None] * along
+        total += float((decay * area_share if law.by_area else decay).sum())
+        largest = max(largest, float((decay if law.by_area else decay / area_share).max()))
     force, (dx, dy) = math.hypot(*law.force), spacing(sheet)
     return force * total / refinement**2, force * largest / (dx * dy)
 
@@ -184,14 +184,11 @@ def describe_forces(record: ProbeRecord) -> str:
 
 
 def force_warnings(scene: Scene, records: Sequence[ProbeRecord]) -> Iterator[str]:
-    """Warn of probes whose forces on this sheet do not add up to their `total`.
+    """Yield warnings of probes whose forces on this sheet do not add up to their `total`.
 
     Args:
         scene: supplies the probes and the sheet.
         records: forces of all probes, from `probe_records`.
-
-    Yields:
-        Warnings with the key, the force and the likely reason.
     """
     across, down = spacing(scene.sheet)
     cell = f"a cell of {across:.3g} x {down:.3g} m"

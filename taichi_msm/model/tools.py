@@ -28,8 +28,8 @@ from taichi_msm.scene.tools import Probe
 from taichi_msm.shapes import SHAPES
 from taichi_msm.shapes.shape import Shape
 
-# Largest displacement of a rough tool between two equilibria, in its radii. Its force depends on the place of its first
-# contact with each mass point.
+# Largest displacement of a rough tool between two equilibria, in radii of the tool. It limits the error of the places
+# where mass points stick, on which the tool's force depends.
 ROUGH_STRIDE_RADII = 1 / 16
 
 # Largest spacing of mass points without a warning, in radii of the tool; a larger one makes the contact force uneven.
@@ -59,7 +59,7 @@ class Tool:
     shape: Shape
     friction: float  # Coulomb's coefficient; infinite if rough
     grips: tuple[tuple[float, float], ...]  # start and end of every grip [s]
-    stride_limit: float  # largest allowed displacement between two equilibria, or (except a clamp's) in a step [m]
+    stride_limit: float  # largest displacement between two equilibria and, except for a clamp, in a step [m]
 
     @property
     def rough(self) -> bool:
@@ -111,7 +111,7 @@ class Tool:
         return bool((depth > -1e-6 * self.radius).any())
 
     def substep_times(self, begin: float, end: float) -> Array:
-        """Divide a time interval into parts with displacements within `stride_limit`; of a rough tool also straight.
+        """Divide a time interval so that the tool moves at most `stride_limit` in each part, and a rough one straight.
 
         Args:
             begin: start of the interval [s].
@@ -150,14 +150,11 @@ def touching_tools(tools: Sequence[Tool]) -> list[Tool]:
 
 
 def build_tools(probes: Sequence[Probe], sheet: Sheet) -> tuple[Tool, ...]:
-    """Build the position-controlled tools of a scene.
+    """Return the position-controlled tools of a scene, in the order of the probes.
 
     Args:
         probes: all probes of the scene; force-controlled ones are skipped.
         sheet: supplies the size, the mass points of clamps and the fixed mass points.
-
-    Returns:
-        Tools in the order of the probes.
     """
     height, width = sheet.size
     tools: list[Tool] = []
@@ -212,15 +209,12 @@ def grip_frames(grip: tuple[float, float], rate: float) -> range:
 
 
 def path_problems(scene: Scene, tools: Sequence[Tool], grid: TimeGrid) -> Iterator[Problem]:
-    """Report tools that begin in the sheet or move too fast, impossible friction, and clamps without mass points.
+    """Yield problems of tools that begin in the sheet or move too fast, of friction, and of clamps.
 
     Args:
         scene: supplies the sheet and the kind of motion.
         tools: position-controlled tools of the scene.
         grid: supplies the step, which limits the speed of tools.
-
-    Yields:
-        Problems with the key, its value and a remedy.
     """
     for tool in tools:
         key = ("probes", tool.probe, "path")
@@ -235,7 +229,7 @@ def path_problems(scene: Scene, tools: Sequence[Tool], grid: TimeGrid) -> Iterat
             yield Problem(key, f"the instrument is {depth:.3g} m in the sheet at rest at 0 s; {remedy}")
         if problem := friction_problem(tool, at_rest=scene.time.at_rest):
             yield Problem(("probes", tool.probe, "friction"), problem)
-        if not scene.time.at_rest and (fault := too_fast(tool, grid)):
+        if not scene.time.at_rest and (fault := speed_problem(tool, grid)):
             yield Problem((*key, fault[0]), fault[1])
 
 
@@ -258,15 +252,15 @@ def _clamp_problems(clamp: Clamp, scene: Scene) -> Iterator[Problem]:
     if clamp.side in fixed_sides(scene.sheet):
         yield Problem((*key, "clamp"), f"{clamp.side} is in sheet.fixed; remove it there, or clamp another side")
     elif not clamp.points.any():
-        text = f"{clamp.side} has no mass point that is neither fixed nor held by a clamp before it; remove one of them"
+        text = f"every mass point of {clamp.side} is fixed or held by an earlier clamp; remove one of them"
         yield Problem((*key, "clamp"), text)
     if any(begin):
         text = f"is {begin}; a clamp begins at rest at 0 s, so put [0, 0, 0, 0] first"
         yield Problem((*key, "path", 0), text)
 
 
-def too_fast(tool: Tool, grid: TimeGrid, first: int = 0) -> tuple[int, str] | None:
-    """Return the keyframe at the end of the fastest segment, and a message about its speed.
+def speed_problem(tool: Tool, grid: TimeGrid, first: int = 0) -> tuple[int, str] | None:
+    """Return the index of the keyframe after the fastest segment, and a message about the speed.
 
     The result is None for a tool that is slow enough for the time step, and for a clamp.
 
@@ -284,33 +278,30 @@ def too_fast(tool: Tool, grid: TimeGrid, first: int = 0) -> tuple[int, str] | No
     )
 
 
-def min_steps_per_frame(tools: Sequence[Tool], grid: TimeGrid, least: int) -> int:
+def min_steps_per_frame(tools: Sequence[Tool], grid: TimeGrid, min_steps: int) -> int:
     """Return the smallest number of steps per frame with which no tool is too fast.
 
     Args:
         tools: position-controlled tools.
         grid: supplies the frame rate.
-        least: lower bound of the number.
+        min_steps: lower bound of the number.
     """
 
     def speed_ratio(tool: Tool) -> float:
-        return tool.max_stride(1 / grid.frames_per_second / least)[0] / tool.stride_limit
+        return tool.max_stride(1 / grid.frames_per_second / min_steps)[0] / tool.stride_limit
 
     # With n times the steps, the largest displacement in a step is 1 / n of the previous one or more, so repeat.
     while (ratio := max(map(speed_ratio, touching_tools(tools)), default=0.0)) > 1 + 1e-9:
-        least = max(least + 1, math.ceil(least * ratio * (1 - 1e-9)))
-    return least
+        min_steps = max(min_steps + 1, math.ceil(min_steps * ratio * (1 - 1e-9)))
+    return min_steps
 
 
 def path_warnings(scene: Scene, tools: Sequence[Tool]) -> Iterator[str]:
-    """Warn of implausible paths and grips, of tools too thin for the mesh, and of tools that intersect.
+    """Yield warnings of implausible paths and grips, of tools too thin for the mesh, and of tools that intersect.
 
     Args:
         scene: supplies the sheet and the duration.
         tools: position-controlled tools of the scene.
-
-    Yields:
-        Warnings with the key, its value and a remedy.
     """
     spacing_max, side, end = max(spacing(scene.sheet)), max(scene.sheet.size), scene.time.duration
     for tool in tools:
@@ -390,7 +381,7 @@ def _axis_distance(a: Tool, b: Tool, offset: Array) -> Array:
 
 
 def gap_to_sheet(tool: Tool, sheet: Sheet) -> float:
-    """Return the distance of a tool at 0 s from the sheet at rest [m]; the negative depth inside the sheet.
+    """Return the distance of a tool at 0 s from the sheet at rest [m], negative inside the sheet.
 
     Args:
         tool: position-controlled tool with a shape.

@@ -27,7 +27,7 @@ from taichi_msm.model.plan import Plan
 class Coefficients(NamedTuple):
     """The coefficients of a step; complex numbers in a complex-step derivative."""
 
-    keep: float  # share of the last difference that remains
+    keep: float  # factor of the last difference
     gain: float  # displacement per force [m/N]
     first_gain: float  # gain of step 0 [m/N]
 

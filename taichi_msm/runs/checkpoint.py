@@ -351,9 +351,9 @@ class Checkpoint:
 
 def _to_arrays(saved: Snapshot) -> dict[str, NDArray[Any]]:
     """Convert a snapshot, without its probes, to arrays by the names of its fields."""
-    greatest = np.array([(peak.time, *peak.force) for peak in saved.felt.greatest]).reshape(-1, PEAK_FORCE_COLUMNS)
-    forces = {"forces": _tip_force_array(saved.felt.forces), "greatest": greatest}
-    named = {**saved.state._asdict(), **asdict(saved.progress), **forces}
+    forces, greatest = saved.probe_forces
+    peaks = np.array([(peak.time, *peak.force) for peak in greatest]).reshape(-1, PEAK_FORCE_COLUMNS)
+    named = {**saved.state._asdict(), **asdict(saved.progress), "forces": _tip_force_array(forces), "greatest": peaks}
     return {name: np.asarray(value) for name, value in named.items()}
 
 

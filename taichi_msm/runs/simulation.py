@@ -39,7 +39,7 @@ from taichi_msm.scene.scene import Scene
 from taichi_msm.scene.tools import Probe
 from taichi_msm.solver.dynamics import ForceRecorder
 from taichi_msm.solver.planning import steer_plan, with_current_paths
-from taichi_msm.solver.rest import build_dynamics
+from taichi_msm.solver.rest import build_solver
 from taichi_msm.solver.state import ProbeForces, Reading, RunProgress, Snapshot, TipForce, largest_displacement
 from taichi_msm.system import runtime
 
@@ -92,7 +92,7 @@ class Simulation:
         self._plan = resolve(plan, self.device).plan
         self._original_probes = self.scene.probes  # before `steer`
         self._closed, self._cores = False, cores
-        self._dynamics = build_dynamics(self._plan, self.device, cores=cores)
+        self._dynamics = build_solver(self._plan, self.device, cores=cores)
         self._reset()
         self.renderer = Renderer(self.scene, texture)
 
@@ -100,7 +100,7 @@ class Simulation:
         """Return to the flat sheet. The first frame of a quasi-static scene is solved when it is needed."""
         self._divergence: DivergedError | None = None
         self._monitor, self._force_recorder = DivergenceMonitor(self._plan), ForceRecorder(self._plan)
-        self._probe_forces = self._force_recorder.at_rest()
+        self._probe_forces = self._force_recorder.at_start()
         flat = to_positions(self._dynamics.displacement(), self.scene.sheet)
         self._frame_positions: Array | None = None if self.scene.time.at_rest else flat
 
@@ -207,7 +207,7 @@ class Simulation:
             self._dynamics.restart(self._plan)
         else:
             self._dynamics.close()
-            self._dynamics = build_dynamics(self._plan, self.device, cores=self._cores)
+            self._dynamics = build_solver(self._plan, self.device, cores=self._cores)
         self._reset()
 
     def change_material(self, scene: Plan | Scene | Mapping[str, Any]) -> None:
@@ -258,7 +258,8 @@ class Simulation:
         steps_in_frame = state.steps - saved.progress.frame * per_frame
         current = self._dynamics.displacement()
         same_mesh = (state.displacement.shape, state.displacement.dtype) == (current.shape, current.dtype)
-        if not (same_mesh and len(saved.felt.forces) == len(self.scene.probes) and 0 <= steps_in_frame <= per_frame):
+        same_probes = len(saved.probe_forces.forces) == len(self.scene.probes)
+        if not (same_mesh and same_probes and 0 <= steps_in_frame <= per_frame):
             raise ArgumentError(
                 f"saved at step {state.steps}, frame {saved.progress.frame}, {state.displacement.dtype} of shape "
                 f"{state.displacement.shape}; take a state saved with this scene's points, probes, precision and step"
@@ -268,7 +269,7 @@ class Simulation:
         self._divergence = None
         self._dynamics.restart(self._plan, saved.state)
         self._frame_positions = to_positions(self._dynamics.displacement(), self.scene.sheet)
-        self._monitor.progress, self._probe_forces = saved.progress, saved.felt
+        self._monitor.progress, self._probe_forces = saved.progress, saved.probe_forces
 
     def positions(self) -> Array:
         """Return the positions of the mass points [m], shape (rows, cols, 3), in the scene's precision; read-only."""
@@ -506,7 +507,7 @@ class Simulation:
         reading = self._dynamics.read()
         self._require_no_fault(reading, self._monitor.check_frame(reading))
         position = to_positions(reading.displacement, self.scene.sheet)
-        self._probe_forces = self._force_recorder.follow(
+        self._probe_forces = self._force_recorder.at_frame(
             self._probe_forces, self.frame, position, self._dynamics.tool_forces()
         )
         self._frame_positions = position

@@ -1,21 +1,24 @@
 """The arrays of a sheet and the functions shared by the CPU and the GPU kernel: step, measures and read-out.
 
-The values of a sheet are vectors of lanes. The columns are divided into strips, one per lane; on a GPU a vector has one
-lane. The values are stored row by row in ndarrays of Taichi. A row has `width` entries: one for every column of a
-strip, and a halo of one entry at both ends. One-dimensional arrays save a few instructions per index:
+The columns of the sheet are divided into strips of equal width, one per lane of a vector; on a GPU a vector has one
+lane. An entry is a vector with one mass point of each strip. A row has `width` entries: one per column of a strip, and
+a halo of one entry at both ends. The rows are stored one after another in one-dimensional ndarrays of Taichi, which
+take fewer instructions per index:
 
     u, d         displacements and last differences [m], as three arrays each, for x, y and z
-    by_column    for the first, a middle and the last row: the inverse of the mass points' share of a cell's mass, 0 if
-                 fixed; and their share of a cell's area. For all rows: x at rest [m]; 1 with a left neighbour, else 0;
-                 1 with a right neighbour, else 0
-    fields       one number per mass point, for every field of every term in turn
+    by_column    COLUMN_ROWS rows of numbers per column (`terms.base`):
+                 MOBILITY: the inverse share of a cell's mass at a mass point, 0 if it is fixed; AREA_SHARE: its share
+                 of a cell's area; three rows each, for the first, a middle and the last row of the sheet
+                 REST_X: x at rest [m]; HAS_LEFT, HAS_RIGHT: 1 with a neighbour on this side, else 0
+    fields       numbers of the terms per mass point, all rows of one field after those of another
     stiffness    with a map, k - tau of every spring, see `SpringTerm.stiffness_array`
     constants    of the sheet and its terms, each in the first lane of an entry
 
-With bending, u also contains rows of moments. The load table contains the variables of the steps, one row per step.
+With bending, u also contains rows of moments. The load table has one row per step: its gain and the columns of the
+terms, such as the force of a tool.
 
-The kernels use vectors down to the machine code (docs/decisions/0010). Some operations of Taichi crash or return wrong
-results for such vectors. Unary minus, `-=`, abs, any and all are therefore not used, and exp is applied lane by lane.
+The compiler does not split these vectors into scalars (docs/decisions/0010). Some operations of Taichi then crash or
+return wrong results, so the kernels avoid unary minus, `-=`, abs, any and all, and apply exp lane by lane.
 """
 
 # No `from __future__ import annotations` here: Taichi reads the annotations of a kernel.
@@ -29,11 +32,10 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from taichi_msm.model.time_grid import DTYPES
 from taichi_msm.solver.state import State
 from taichi_msm.system.runtime import Memory, compilation_options, ti, write_vectors
 from taichi_msm.terms.base import AREA_SHARE, GAIN, MOBILITY, SQUARED_MOTION, KernelConfig, KernelSheet
-
-NUMBER_BYTES = {"f32": 4, "f64": 8}
 
 
 @dataclass(frozen=True)
@@ -80,25 +82,22 @@ def to_lanes(layout: SheetLayout, values: NDArray[Any]) -> NDArray[Any]:
     """
     column = np.arange(layout.config.lanes) * layout.strip + np.arange(-1, layout.strip + 1)[:, None]
     inside = (column >= 0) & (column < layout.cols)
-    real = np.float32 if layout.config.precision == "f32" else np.float64
+    dtype = DTYPES[layout.config.precision]
     with np.errstate(over="ignore"):
-        laid = np.take(values.astype(real), column * inside, axis=-1) * inside.astype(real)
-    return laid.reshape(-1, layout.config.lanes)
+        entries = np.take(values.astype(dtype), column * inside, axis=-1) * inside.astype(dtype)
+    return entries.reshape(-1, layout.config.lanes)
 
 
 def from_lanes(layout: SheetLayout, entries: NDArray[Any], rows: int) -> NDArray[Any]:
-    """Arrange entries by column, the inverse of `to_lanes`.
+    """Return the values of entries by column, shape (rows, cols), the inverse of `to_lanes`.
 
     Args:
         layout: layout of the sheet.
         entries: entries with halo, shape (entries, lanes), at least `rows` rows of them.
         rows: number of rows.
-
-    Returns:
-        Values, shape (rows, cols).
     """
-    laid = entries[: rows * layout.width].reshape(rows, layout.width, layout.config.lanes)
-    return laid[:, 1:-1].transpose(0, 2, 1).reshape(rows, -1)[:, : layout.cols]
+    by_row = entries[: rows * layout.width].reshape(rows, layout.width, layout.config.lanes)
+    return by_row[:, 1:-1].transpose(0, 2, 1).reshape(rows, -1)[:, : layout.cols]
 
 
 class SheetArrays:
@@ -106,30 +105,32 @@ class SheetArrays:
 
     Args:
         layout: layout of the sheet.
-        stored: row of the sheet in each row of the array u, or -1 for other content, shape (rows of u,).
+        sheet_rows: index of the row of the sheet in each row of u; -1 for other content, shape (rows of u,).
         start: initial values.
     """
 
-    def __init__(self, layout: SheetLayout, stored: NDArray[np.int32], start: InitialData) -> None:
-        lanes, no_values = layout.config.lanes, np.zeros((0, layout.cols))
-        self._layout = layout
+    def __init__(self, layout: SheetLayout, sheet_rows: NDArray[np.int32], start: InitialData) -> None:
+        lanes = layout.config.lanes
+        self._layout, self._sheet_rows = layout, sheet_rows
         self._memory = Memory()
-        self.u = [self.rows(len(stored)) for _ in range(3)]
-        self.d = [self.rows(layout.rows) for _ in range(3)]
+        self.u = [self.allocate_rows(len(sheet_rows)) for _ in range(3)]
+        self.d = [self.allocate_rows(layout.rows) for _ in range(3)]
         self.constants = self._memory.array(layout.config.precision, lanes, len(start.constants))
-        self.by_column = self.rows(len(start.by_column))
-        self.fields = self.rows(max(1, len(start.fields)) * layout.rows)
-        self.stiffness = self.rows(1 if start.stiffness is None else len(start.stiffness))
-        real = np.float32 if layout.config.precision == "f32" else np.float64
+        self.by_column = self.allocate_rows(len(start.by_column))
+        self.fields = self.allocate_rows(max(1, len(start.fields)) * layout.rows)
+        self.stiffness = self.allocate_rows(1 if start.stiffness is None else len(start.stiffness))
         with np.errstate(over="ignore"):
-            write_vectors(self.constants, np.repeat(start.constants[:, None].astype(real), lanes, axis=1))
+            write_vectors(self.constants, np.repeat(start.constants[:, None], lanes, axis=1))
         self._set(self.by_column, start.by_column)
         if start.stiffness is not None:
             self._set(self.stiffness, start.stiffness)
-        state, held = start.state, (stored >= 0)[:, None]
-        for c in range(3):
-            self._set(self.u[c], no_values if state is None else np.where(held, state.displacement[stored, :, c], 0))
-            self._set(self.d[c], no_values if state is None else state.difference[..., c])
+        if start.state is None:
+            for array in (*self.u, *self.d):
+                self._set(array, np.zeros((0, layout.cols)))
+        else:
+            self.set_displacement(start.state.displacement)
+            for c in range(3):
+                self._set(self.d[c], start.state.difference[..., c])
         self._set(self.fields, start.fields)
 
     @property
@@ -137,20 +138,16 @@ class SheetArrays:
         """All arrays, in the order of the kernels' arguments."""
         return *self.u, *self.d, self.constants, self.by_column, self.stiffness, self.fields
 
-    def get_fields(self, first: int, count: int) -> NDArray[Any]:
-        """Read consecutive fields of the terms.
+    def set_displacement(self, displacement: NDArray[Any]) -> None:
+        """Set the displacements [m], shape (rows, cols, 3), and all other content of u to 0."""
+        has_row = (self._sheet_rows >= 0)[:, None]
+        for c in range(3):
+            self._set(self.u[c], np.where(has_row, displacement[self._sheet_rows, :, c], 0))
 
-        Args:
-            first: index of the first field.
-            count: number of fields.
-
-        Returns:
-            Fields, shape (count, rows, cols).
-        """
+    def get_field(self, index: int) -> NDArray[Any]:
+        """Read a field of a term, shape (rows, cols)."""
         layout = self._layout
-        entries = self.fields.to_numpy()[first * layout.rows * layout.width :]
-        values = from_lanes(layout, entries, count * layout.rows)
-        return np.ascontiguousarray(values.reshape(count, layout.rows, layout.cols))
+        return from_lanes(layout, self.fields.to_numpy()[index * layout.rows * layout.width :], layout.rows)
 
     def set_fields(self, first: int, values: NDArray[Any]) -> None:
         """Replace consecutive fields of the terms.
@@ -159,16 +156,16 @@ class SheetArrays:
             first: index of the first field.
             values: new values, shape (fields, rows, cols).
         """
-        entries, laid = self.fields.to_numpy(), to_lanes(self._layout, values)
+        entries, new = self.fields.to_numpy(), to_lanes(self._layout, values)
         at = first * self._layout.rows * self._layout.width
-        entries[at : at + len(laid)] = laid
+        entries[at : at + len(new)] = new
         self.fields.from_numpy(entries)
 
     def _set(self, array: Any, values: NDArray[Any]) -> None:
         """Set the first rows of an array to values of shape (..., cols), and all other rows to 0."""
         write_vectors(array, to_lanes(self._layout, values))
 
-    def rows(self, count: int) -> Any:
+    def allocate_rows(self, count: int) -> Any:
         """Allocate an array of `count` rows with arbitrary content."""
         return self._memory.array(self._layout.config.precision, self._layout.config.lanes, count * self._layout.width)
 
@@ -211,9 +208,9 @@ class StepKernel(SheetKernel, ABC):
         """Compile all kernels without taking a step."""
 
 
-def point_forces(config: KernelConfig) -> list[Callable[..., Any]]:
+def build_point_forces(config: KernelConfig) -> list[Callable[..., Any]]:
     """Build the Taichi functions that add the forces of all terms except springs."""
-    # The order of summation determines the last bits.
+    # Bending, with the largest reach, comes first: the order of summation determines the last bits.
     ordered = sorted(config.terms, key=lambda term: -term.reach)
     return [force for term in ordered for force in term.build_forces(config)]
 
@@ -223,12 +220,12 @@ def build_point_step(config: KernelConfig) -> Callable[..., None]:
 
     d_{n+1} = keep d_n + gain F_n,    u_{n+1} = u_n + d_{n+1}                                  (eq. 6 to 9)
     """
-    forces = point_forces(config)
+    forces = build_point_forces(config)
     damping = [reduce for term in config.terms for reduce in term.build_damping(config)]
 
     @ti.func
     def move(sheet: ti.template(), entry: ti.template(), target, force: ti.template(), now: ti.template()):
-        """Step an entry and store it in row `target` of u; `force` is that of its springs, `now` a row of loads."""
+        """Step an entry with the force of its springs and a row of the load table, `now`, into row `target` of u."""
         for add in ti.static(forces):
             add(force, sheet, entry, now)
         gain = now[GAIN] * sheet.by_column[(MOBILITY + entry.row.kind) * sheet.width + entry.b]
@@ -252,7 +249,8 @@ def build_read(config: KernelConfig, *, parallel: bool, iterations: int) -> Call
     Args:
         config: compile-time configuration.
         parallel: whether to distribute the rows over threads.
-        iterations: number of loop iterations per row; only the first of them does work.
+        iterations: iterations of the loop per row, of which the first does the work: ITERATIONS_PER_THREAD for one row
+            per CPU thread.
 
     Returns:
         The kernel `read`, see `SheetKernel.read`.

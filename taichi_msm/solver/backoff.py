@@ -1,8 +1,7 @@
 """Back-off of workers that wait for each other by spinning, on a CPU that other programs use too.
 
-After the timeout of a worker, a single worker steps for a back-off period. The period is the minimum, or longer if
-other programs compete for the cores: four times the last period, halved for every HALF_LIFE_S of parallel steps since
-then.
+After the timeout of a worker, a single worker steps for a back-off period of MIN_BACKOFF_S. If other programs compete
+for the cores, the period is longer: four times the last one, halved for every HALF_LIFE_S of parallel steps since then.
 """
 
 from __future__ import annotations
@@ -20,7 +19,7 @@ class Backoff:
 
     def __init__(self) -> None:
         self._period = self._until = 0.0
-        # Start of the parallel launch, and duration of all of them since the last back-off [s].
+        # Start of the last parallel launch, and duration of all parallel launches since the last back-off [s].
         self._start = self._parallel_s = 0.0
         # CPU time of this process, and time waited for a core, at the end of the last back-off [s].
         self._cpu_time, self._wait_time = 0.0, 0.0

@@ -9,8 +9,8 @@ copies its row, alternately into one of two buffers, and waits for the neighbour
 depend on the direction of a pass, so results are independent of the number of workers, to the bit.
 
 Bending. A moment is the Laplacian of the displacements, and the force on a row is the Laplacian of the moments. Before
-a row is stepped, the moments of the next row are computed, which depend on one row more. A pass then takes one step,
-and neighbours copy two rows.
+a row is stepped, the moments of the next row are computed, which depend on one row more. With bending, a pass therefore
+takes only one step, and workers copy two rows.
 
 Timeout. A worker waits by spinning. If another program has taken the neighbour's core, spinning would waste its own, so
 after a limited number of checks the worker records its progress and ends. Further launches continue from there.
@@ -28,16 +28,22 @@ from taichi_msm.system.runtime import ITERATIONS_PER_THREAD, ti
 from taichi_msm.terms.base import DY, KernelConfig, KernelRow, KernelSheet
 from taichi_msm.terms.bending import BendingTerm
 
-# Integer arguments of a launch: steps taken before it; steps to take; workers; steps of a pass; rows of `carried` per
-# worker; rows of the sheet; columns of a strip; the first row that is not fixed, and the row after the last; the first
-# row of moments in u; the number of checks after which a waiting worker ends.
+# Integer arguments of a launch
+#   FIRST, COUNT        steps taken before the launch; steps to take
+#   WORKERS, DEPTH      workers; steps of a pass
+#   CARRIED_ROWS        rows of `carried` per worker
+#   ROWS, STRIP         rows of the sheet; columns of a strip
+#   FIRST_ROW, END_ROW  the first row that is not fixed; the row after the last one
+#   MOMENT_ROW          the first row of moments in u
+#   MAX_CHECKS          number of checks after which a waiting worker ends
 FIRST, COUNT, WORKERS, DEPTH, CARRIED_ROWS, ROWS, STRIP, FIRST_ROW, END_ROW, MOMENT_ROW, MAX_CHECKS = range(11)
 
 # The borders of a band at which its worker begins and ends.
 BEGIN, END = 0, 1
 
-# Integers of a worker in the array `progress`: for each border, in a separate cache line, the number of steps taken at
-# the border. The first of these lines also contains the worker's pass, round, and step of the round.
+# The array `progress` has WORKER_STRIDE integers per worker: a cache line of COUNTER_STRIDE integers for each border,
+# which begins with the number of steps taken there. The first line also contains the worker's pass, its round, and the
+# step of the round.
 COUNTER_STRIDE = 16
 WORKER_STRIDE = 2 * COUNTER_STRIDE
 PASS_INDEX, ROUND, STEP = 1, 2, 3
@@ -59,12 +65,12 @@ class RowBand(NamedTuple):
     progress: Any  # array of all workers
 
 
-def build_join_strips(config: KernelConfig) -> Callable[..., None]:
+def build_fill_halo(config: KernelConfig) -> Callable[..., None]:
     """Build the Taichi function that fills the halo of a row."""
     vector, lanes = config.vector, config.lanes
 
     @ti.func
-    def join_strips(u: ti.template(), p, width):
+    def fill_halo(u: ti.template(), p, width):
         """Fill the halo of row p with the last column of the previous strip and the first one of the next strip."""
         for c in ti.static(range(3)):
             last = u[c][p * width + width - 2]
@@ -72,7 +78,7 @@ def build_join_strips(config: KernelConfig) -> Callable[..., None]:
             u[c][p * width + 0] = vector([last[(lane - 1) % lanes] for lane in ti.static(range(lanes))])
             u[c][p * width + width - 1] = vector([first[(lane + 1) % lanes] for lane in ti.static(range(lanes))])
 
-    return join_strips
+    return fill_halo
 
 
 def build_step_row(
@@ -87,29 +93,29 @@ def build_step_row(
         parallel: whether the band has neighbours.
 
     Returns:
-        The Taichi function step_row(sheet, carried, loads, band, row, n, at, carry, moments).
+        The Taichi function step_row(sheet, carried, loads, band, row, n, steps_before, carry, moments).
     """
     vector, bending, copied = config.vector, config.get(BendingTerm), config.reach
-    join_strips = build_join_strips(config)
+    fill_halo = build_fill_halo(config)
     pass_row, storing = build_pass_row(config, move), [bending.build_store_moment(config)] if bending else []
     corrections = [term.build_correction(config) for term in config.terms if corrects]
     correcting = [build_correct_row(config, correction) for correction in corrections if correction]
 
     @ti.func
-    def copy_row(rows, worker, border, n, behind):
-        """Return the index in u of a worker's copy of the row `behind` rows inside a border, after n steps."""
+    def copy_at(rows, worker, border, n, behind):
+        """Return the index in u of a copy of a worker's row, `behind` rows inward from a border, after n steps."""
         return rows + copied * (4 * worker + 2 * border + ti.cast(n % 2, ti.i32)) + behind
 
     @ti.func
     def row_at(band: ti.template(), row, n):
-        """Return the index in u of a row in or next to a band, after n steps; arbitrary beyond the sheet."""
+        """Return the index in u of a row in or next to a band, after n steps; any index for a row beyond the sheet."""
         i = ti.select(band.direction > 0, band.low, band.high - 1) + row * band.direction
         stored = ti.max(0, ti.min(i, band.rows - 1))
         if ti.static(parallel):
             if row < 0 and 0 <= band.worker - band.direction < band.workers:
-                stored = copy_row(band.rows, band.worker - band.direction, BEGIN, n, -1 - row)
+                stored = copy_at(band.rows, band.worker - band.direction, BEGIN, n, -1 - row)
             if row >= band.high - band.low and 0 <= band.worker + band.direction < band.workers:
-                stored = copy_row(band.rows, band.worker + band.direction, END, n, row - (band.high - band.low))
+                stored = copy_at(band.rows, band.worker + band.direction, END, n, row - (band.high - band.low))
         return stored
 
     @ti.func
@@ -124,9 +130,9 @@ def build_step_row(
 
     @ti.func
     def publish(sheet: ti.template(), band: ti.template(), border, i, inward, n):
-        """Copy row i, and with bending the next row inward, after n steps for the neighbour at a border."""
+        """Copy row i after n steps, and with bending the next row inward, for the neighbour at a border."""
         for behind in ti.static(range(copied)):
-            copy = copy_row(band.rows, band.worker, border, n, behind)
+            copy = copy_at(band.rows, band.worker, border, n, behind)
             for b in range(sheet.width):
                 for c in ti.static(range(3)):
                     sheet.u[c][copy * sheet.width + b] = sheet.u[c][(i + behind * inward) * sheet.width + b]
@@ -142,12 +148,12 @@ def build_step_row(
             for b in range(1, sheet.width - 1):
                 for store_moment in ti.static(storing):
                     store_moment(sheet, begin + ahead * band.direction, before, middle, after, b, target)
-            join_strips(sheet.u, target, sheet.width)
+            fill_halo(sheet.u, target, sheet.width)
 
     @ti.func
     def step_row(
         sheet: ti.template(), carried: ti.template(), loads: ti.template(), band: ti.template(),
-        row, n, at, carry, moments,
+        row, n, steps_before, carry, moments,
     ):  # fmt: skip
         """Step a row of a band; return False after a timeout.
 
@@ -158,7 +164,7 @@ def build_step_row(
             band: a `RowBand`.
             row: row of the band, from 0 at its beginning; -1 for the row before, whose forces are only computed.
             n: step of the launch, the row of `loads`.
-            at: number of steps taken before this one in the run.
+            steps_before: number of steps taken before this one in the run.
             carry: row of `carried`.
             moments: first row of the worker's moments in u.
         """
@@ -172,16 +178,16 @@ def build_step_row(
         ready = True
         if ti.static(parallel):
             if row == -1 and 0 <= begin_worker < band.workers:
-                ready = wait_for(band, begin_worker, BEGIN, at)
-                source = copy_row(band.rows, begin_worker, BEGIN, at, 0)
+                ready = wait_for(band, begin_worker, BEGIN, steps_before)
+                source = copy_at(band.rows, begin_worker, BEGIN, steps_before, 0)
             # With bending, the step depends on one more row.
             if ready and row > last - copied and 0 <= end_worker < band.workers:
-                ready = wait_for(band, end_worker, END, at)
+                ready = wait_for(band, end_worker, END, steps_before)
             if row == last and 0 <= end_worker < band.workers:
-                next_row = copy_row(band.rows, end_worker, END, at, 0)
+                next_row = copy_at(band.rows, end_worker, END, steps_before, 0)
         if ready:
             if ti.static(len(storing) > 0):
-                store_moments(sheet, band, row, moments, at)
+                store_moments(sheet, band, row, moments, steps_before)
             next_row = ti.select(exists > 0, next_row, i)
             if 0 <= i < band.rows:
                 kind = ti.select(i == band.rows - 1, 2, ti.select(i == 0, 0, 1))
@@ -198,13 +204,13 @@ def build_step_row(
                     for c in ti.static(range(3)):
                         carried[c][carry * sheet.width + b] = vector(0)
             if row >= 0:
-                join_strips(sheet.u, i, sheet.width)
+                fill_halo(sheet.u, i, sheet.width)
             if ti.static(parallel):
                 # Copy as soon as all rows to be copied are stepped.
                 if row == copied - 1:
-                    publish(sheet, band, BEGIN, begin, band.direction, at + 1)
+                    publish(sheet, band, BEGIN, begin, band.direction, steps_before + 1)
                 if row == last:
-                    publish(sheet, band, END, i, -band.direction, at + 1)
+                    publish(sheet, band, END, i, -band.direction, steps_before + 1)
         return ready
 
     return step_row
@@ -229,14 +235,14 @@ def build_advance(config: KernelConfig, *, parallel: bool) -> Callable[..., None
     def step_band(
         sheet: ti.template(), carried: ti.template(), loads: ti.template(), band: ti.template(), sizes: ti.template()
     ):
-        """Perform the steps of a launch on a band, from the worker's recorded progress on, and record it again."""
-        first, place = sizes[FIRST], WORKER_STRIDE * band.worker
+        """Take the steps of a launch on a band, from the worker's recorded progress on, and record the new progress."""
+        first, own = sizes[FIRST], WORKER_STRIDE * band.worker
         count, depth = ti.cast(sizes[COUNT], ti.i32), ti.cast(sizes[DEPTH], ti.i32)
         carried_rows = ti.cast(sizes[CARRIED_ROWS], ti.i32)
         moments = ti.cast(sizes[MOMENT_ROW], ti.i32) + MOMENT_ROWS * band.worker
-        pass_index = ti.cast(band.progress[place + PASS_INDEX], ti.i32)
-        k = ti.cast(band.progress[place + ROUND], ti.i32)
-        step = ti.cast(band.progress[place + STEP], ti.i32)
+        pass_index = ti.cast(band.progress[own + PASS_INDEX], ti.i32)
+        k = ti.cast(band.progress[own + ROUND], ti.i32)
+        step = ti.cast(band.progress[own + STEP], ti.i32)
         # A vector with a variable index makes the compiler align the stack, and with it all spilled vectors, which
         # saves up to 7 % of a step. `ready` is always True here.
         aligned = vector(0)
@@ -258,9 +264,9 @@ def build_advance(config: KernelConfig, *, parallel: bool) -> Callable[..., None
                 pass_index += 1
                 k = -1
                 step = 0
-        band.progress[place + PASS_INDEX] = pass_index
-        band.progress[place + ROUND] = k
-        band.progress[place + STEP] = step
+        band.progress[own + PASS_INDEX] = pass_index
+        band.progress[own + ROUND] = k
+        band.progress[own + STEP] = step
 
     @ti.kernel
     def advance(

@@ -15,7 +15,7 @@ from taichi_msm.terms.contact import CORRECTIONS, ContactTerm
 
 
 def sum_corrections(layout: SheetLayout, arrays: SheetArrays, *, clear: bool) -> NDArray[np.float64]:
-    """Sum the contact corrections over the mass points, weighted with their shares of a cell's mass.
+    """Return the sums of the contact corrections [m], weighted with shares of a cell's mass, shape (tools, 3).
 
     The order of summation depends neither on lanes nor on workers.
 
@@ -23,9 +23,6 @@ def sum_corrections(layout: SheetLayout, arrays: SheetArrays, *, clear: bool) ->
         layout: layout of the sheet.
         arrays: arrays of the sheet.
         clear: whether to set the corrections to 0 afterwards.
-
-    Returns:
-        Sums [m], shape (tools, 3).
     """
     contact = layout.config.get(ContactTerm)
     if contact is None:
@@ -58,7 +55,7 @@ def _build_sum(config: KernelConfig) -> Callable[..., None]:
             fields: as in `SheetArrays`.
             sums: output [m], shape (tools x 3, rows).
         """
-        share_of, corrections = ti.static(by_column, fields)
+        area_shares, corrections = ti.static(by_column, fields)
         ti.loop_config(serialize=serial)
         for i in range(rows):
             strip, kind = (cols + lanes - 1) // lanes, ti.select(i == rows - 1, 2, ti.select(i == 0, 0, 1))
@@ -71,10 +68,10 @@ def _build_sum(config: KernelConfig) -> Callable[..., None]:
                 if largest.max() > 0:
                     for lane in ti.static(range(lanes)):
                         for b in range(1, strip + 1):
-                            share = ti.cast(1, ti.f64)
+                            area_share = ti.cast(1, ti.f64)
                             if ti.static(by_area):
-                                share = ti.cast(share_of[(AREA_SHARE + kind) * (strip + 2) + b][lane], ti.f64)
-                            total += share * ti.cast(corrections[row + b][lane], ti.f64)
+                                area_share = ti.cast(area_shares[(AREA_SHARE + kind) * (strip + 2) + b][lane], ti.f64)
+                            total += area_share * ti.cast(corrections[row + b][lane], ti.f64)
                     if clear:
                         for b in range(1, strip + 1):
                             corrections[row + b] = vector(0)

@@ -16,6 +16,7 @@ from taichi_msm.model.loads import FrameLoad, average_loads, decay
 from taichi_msm.model.plan import Plan
 from taichi_msm.model.sheet import rest_positions
 from taichi_msm.model.surface import surface_point
+from taichi_msm.model.time_grid import DTYPES
 from taichi_msm.model.tool_force import probe_force
 from taichi_msm.model.verlet import coefficients, mean_force
 from taichi_msm.solver.arrays import InitialData, SheetLayout, StepKernel
@@ -26,12 +27,12 @@ from taichi_msm.solver.sheet_solver import SheetSolver
 from taichi_msm.solver.state import PeakForce, ProbeForces, Reading, State, TipForce
 from taichi_msm.terms.base import GAIN
 
-# Largest numbers of steps times mass points, about 0.1 s of one core, and of steps in a launch. Ctrl-C is handled only
-# between launches.
+# Limits of a launch, because Ctrl-C is handled only between launches: the number of steps times mass points, about
+# 0.1 s of one core, and the number of steps.
 POINT_STEPS_PER_LAUNCH = 40_000_000
 MAX_STEPS_PER_LAUNCH = 8192
 
-# Number of rows of a load table; fewer rows hardly take less time to compute.
+# Number of steps in a load table; a shorter one takes hardly less time to compute.
 STEPS_PER_TABLE = 4096
 
 Array = NDArray[np.float64]
@@ -54,7 +55,7 @@ class Dynamics(SheetSolver[StepKernel]):
 
     def steer(self, plan: Plan) -> None:
         super().steer(plan)
-        # A caller that steers usually steers again at the next frame, so the table has only the steps of one frame.
+        # The next frame is usually steered again, so the table has the steps of one frame only.
         self._tabulate(plan.grid.steps_per_frame)
 
     def advance(self, steps: int, pause: Pause = lambda: None) -> None:
@@ -94,20 +95,17 @@ class Dynamics(SheetSolver[StepKernel]):
     def tool_forces(self) -> NDArray[np.float64]:
         """Compute the mean force of each position-controlled tool since the previous frame [N], shape (tools, 3).
 
-        It has the effect of the contact corrections (`verlet.mean_force`), summed over mass points.
+        The force would displace the mass points by the sum of the contact corrections, see `verlet.mean_force`.
         """
         sums = sum_corrections(self.layout, self.kernel.arrays, clear=False)
         return mean_force(self.plan, sums, self.plan.grid.steps_per_frame)
 
     def step_table(self, first: int, count: int) -> NDArray[Any]:
-        """Compute the load table of consecutive steps.
+        """Return the load table of consecutive steps, shape (count, columns).
 
         Args:
             first: number of the first step.
             count: number of steps.
-
-        Returns:
-            Load table, shape (count, columns).
         """
         table = self._load_table(average_loads(self.plan, first, count), first)
         _, table[:, GAIN], first_gain = coefficients(self.plan)
@@ -134,7 +132,7 @@ class Dynamics(SheetSolver[StepKernel]):
 class ForceRecorder:
     """Computes the forces of all probes on the sheet at the frames of a run, and their maxima.
 
-    The force of a force-controlled probe at a frame is (percent(t) / 100) force times the sum of its decay factors over
+    The force of a force-controlled probe is percent(t) / 100 times its `force` times the sum of its decay factors over
     the mass points that are not fixed. The solver computes the forces of position-controlled tools.
     """
 
@@ -145,30 +143,28 @@ class ForceRecorder:
         # Sums of the decay factors of stationary control points, by probe.
         self._stationary: dict[int, float] = {}
 
-    def at_rest(self) -> ProbeForces:
+    def at_start(self) -> ProbeForces:
         """Compute the forces at the first frame."""
-        plan, real = self._plan, np.float32 if self._plan.grid.precision == "f32" else np.float64
-        forces = self._forces(0, rest_positions(plan.scene.sheet).astype(real), np.zeros((len(plan.tools), 3)))
+        plan = self._plan
+        position = rest_positions(plan.scene.sheet).astype(DTYPES[plan.grid.precision])
+        forces = self._forces(0, position, np.zeros((len(plan.tools), 3)))
         return ProbeForces(forces, tuple(PeakForce(0.0, tip.force) for tip in forces))
 
-    def follow(self, before: ProbeForces, frame: int, position: NDArray[Any], tools: Array) -> ProbeForces:
-        """Compute the forces at a frame and their maxima up to it.
+    def at_frame(self, before: ProbeForces, frame: int, position: NDArray[Any], tool_forces: Array) -> ProbeForces:
+        """Return the forces at a frame and their maxima up to it.
 
         Args:
             before: forces and maxima at the previous frame.
             frame: number of the frame.
             position: positions of the mass points [m], shape (rows, cols, 3).
-            tools: forces of the position-controlled tools [N], shape (tools, 3), see `SheetSolver.tool_forces`.
-
-        Returns:
-            Forces at the frame, and maxima up to it.
+            tool_forces: forces of the position-controlled tools [N], shape (tools, 3), see `SheetSolver.tool_forces`.
         """
-        forces, time = self._forces(frame, position, tools), frame / self._plan.grid.frames_per_second
+        forces, time = self._forces(frame, position, tool_forces), frame / self._plan.grid.frames_per_second
         peaks = zip(before.greatest, (PeakForce(time, tip.force) for tip in forces), strict=True)
         return ProbeForces(forces, tuple(max(pair, key=lambda peak: math.hypot(*peak.force)) for pair in peaks))
 
-    def _forces(self, frame: int, position: NDArray[Any], tools: Array) -> tuple[TipForce, ...]:
-        plan, moved = self._plan, iter(zip(self._plan.tools, tools.tolist(), strict=True))
+    def _forces(self, frame: int, position: NDArray[Any], tool_forces: Array) -> tuple[TipForce, ...]:
+        plan, moved = self._plan, iter(zip(self._plan.tools, tool_forces.tolist(), strict=True))
         rate, sheet, forces = plan.grid.frames_per_second, plan.scene.sheet, []
         for index, probe in enumerate(plan.scene.probes):
             if probe.moved:
@@ -176,11 +172,11 @@ class ForceRecorder:
                 forces.append(TipForce(index, tool.lowest_point(frame / rate), (x, y, z)))
                 continue
             percent, at = self._loads[index].at(frame, rate)
-            share = percent / 100 * self._decay_sum(index, at) if percent else 0.0
+            factor = percent / 100 * self._decay_sum(index, at) if percent else 0.0
             x, y, z = probe_force(probe, sheet).force
             tip, _ = surface_point(position, plan.scene.render.refine, sheet, at)
             # Adding 0 turns -0 into 0.
-            forces.append(TipForce(index, tuple(tip.tolist()), (share * x + 0.0, share * y + 0.0, share * z + 0.0)))
+            forces.append(TipForce(index, tuple(tip.tolist()), (factor * x + 0.0, factor * y + 0.0, factor * z + 0.0)))
         return tuple(forces)
 
     def _decay_sum(self, index: int, at: Array) -> float:

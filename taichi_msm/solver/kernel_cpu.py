@@ -13,8 +13,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from taichi_msm.model.time_grid import DTYPES
 from taichi_msm.solver import bands
-from taichi_msm.solver.arrays import NUMBER_BYTES, InitialData, SheetArrays, SheetLayout, StepKernel, build_read
+from taichi_msm.solver.arrays import InitialData, SheetArrays, SheetLayout, StepKernel, build_read
 from taichi_msm.solver.backoff import Backoff
 from taichi_msm.system.compiler import active_compiler
 from taichi_msm.system.runtime import ITERATIONS_PER_THREAD, compilation_options, ti
@@ -45,18 +46,17 @@ class ScatterKernel(StepKernel):
         self._serial_kernel = bands.build_advance(layout.config, parallel=False)
         self._steps, self._backoff = 0, Backoff()
         self._first_row, self._end_row = int(layout.fixed_rows[0]), layout.rows - int(layout.fixed_rows[1])
-        # The sheet's rows, two copies for every border of every worker, and moments.
+        # After the rows of the sheet, u contains two copies for every border of every worker, and rows of moments.
         self._borders = self._border_rows()
         moments = 0 if layout.config.get(BendingTerm) is None else bands.MOMENT_ROWS * layout.workers
         sheet_rows = np.arange(layout.rows, dtype=np.int32), self._borders, np.full(moments, -1, np.int32)
         self.arrays = SheetArrays(layout, np.concatenate(sheet_rows), start)
-        # Rows of `carried` per worker: one per step of a pass, and one page, which no prefetcher crosses.
-        row_bytes = layout.width * layout.config.lanes * NUMBER_BYTES[layout.config.precision]
+        # Rows of carried forces per worker: one per step of a pass, and one page, which no prefetcher crosses.
+        row_bytes = layout.width * layout.config.lanes * DTYPES[layout.config.precision].itemsize
         self._carried_rows = layout.depth - (-PAGE_BYTES // row_bytes)
-        # Forces carried to the next row, per worker and step of a pass.
-        self._carried = [self.arrays.rows(layout.workers * self._carried_rows) for _ in range(3)]
+        self._carried = [self.arrays.allocate_rows(layout.workers * self._carried_rows) for _ in range(3)]
         self._progress = np.zeros(layout.workers * bands.WORKER_STRIDE, np.int64)
-        self._places = self._progress.reshape(-1, bands.WORKER_STRIDE)  # a view, with one row per worker
+        self._progress_by_worker = self._progress.reshape(-1, bands.WORKER_STRIDE)  # a view
 
     def advance(self, count: int, table: NDArray[Any]) -> None:
         if self._layout.workers == 1:
@@ -86,11 +86,11 @@ class ScatterKernel(StepKernel):
     def _advance_in_backoff(self, first: int, end: int, table: NDArray[Any]) -> int:
         """Advance with a single worker until the back-off ends; return the number of the next step."""
         # The duration of a step is unknown, so the number of steps per launch starts small and doubles.
-        piece = self._layout.depth
+        steps = self._layout.depth
         while first < end and self._backoff.is_active:
-            until = min(first + piece, end)
+            until = min(first + steps, end)
             self._advance_alone(first, until, table)
-            first, piece = until, 2 * piece
+            first, steps = until, 2 * steps
         self._copy_borders()
         return first
 
@@ -99,7 +99,7 @@ class ScatterKernel(StepKernel):
         workers, depth, count, steps_before = self._layout.workers, self._layout.depth, end - first, self._steps
         self._start_pass()
         self._launch(self._parallel_kernel, workers, count, table[first:])
-        passes, rounds = self._places[:, bands.PASS_INDEX], self._places[:, bands.ROUND]
+        passes, rounds = (self._progress_by_worker[:, column] for column in (bands.PASS_INDEX, bands.ROUND))
         timed_out = not (passes * depth >= count).all()
         if timed_out:
             # All workers continue to the end of the pass that the foremost worker has begun.
@@ -117,7 +117,7 @@ class ScatterKernel(StepKernel):
         self._progress[:: bands.COUNTER_STRIDE] = self._steps
 
     def _start_pass(self) -> None:
-        self._places[:, [bands.PASS_INDEX, bands.ROUND, bands.STEP]] = 0, -1, 0
+        self._progress_by_worker[:, [bands.PASS_INDEX, bands.ROUND, bands.STEP]] = 0, -1, 0
 
     def _launch(self, kernel: Callable[..., None], workers: int, count: int, table: NDArray[Any]) -> None:
         layout = self._layout
@@ -131,7 +131,7 @@ class ScatterKernel(StepKernel):
         self._steps += count
 
     def _border_rows(self) -> NDArray[np.int32]:
-        """Return the row of the sheet that each copy at a border of a band contains."""
+        """Return the index of the sheet's row in each copy, shape (copies,)."""
         rows: list[int] = []
         first, end, workers = self._first_row, self._end_row, self._layout.workers
         for worker in range(workers):
@@ -158,7 +158,7 @@ def _build_copy(config: KernelConfig) -> Callable[..., None]:
 
         Args:
             u_x, u_y, u_z: displacements [m].
-            borders: row of the sheet that each copy contains, shape (copies,).
+            borders: index of the sheet's row in each copy, shape (copies,).
             rows: number of rows of the sheet.
             width: number of entries of a row.
         """

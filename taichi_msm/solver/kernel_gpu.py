@@ -1,7 +1,7 @@
 """Kernel 1 on a GPU: one thread per mass point gathers the forces of its eight springs; one loop per step.
 
-Vectors have one lane, rows have one entry per column, and the sheet has a halo. Two buffers alternately contain u_n and
-u_{n+1}; with bending, a third buffer contains the moments.
+Vectors have one lane, and a row has one entry per column. Two buffers of u alternately contain u_n and u_{n+1}; with
+bending, a third one contains the moments. Each buffer has a halo of one row above and below.
 """
 
 # No `from __future__ import annotations` here: Taichi reads the annotations of a kernel.
@@ -35,23 +35,24 @@ class GatherKernel(StepKernel):
         self._layout = layout
         self._advance = _build_advance(layout.config)
         self._read = build_read(layout.config, parallel=True, iterations=1)
-        # Index of the buffer of u_n. Each buffer has a halo of one row above and below.
-        self._now, self._top_row = 0, 1
-        buffer = np.pad(np.arange(layout.rows, dtype=np.int32), 1, constant_values=-1)
+        # Index of the buffer with u_n.
+        self._buffer, self._top_row = 0, 1
+        buffer_rows = np.pad(np.arange(layout.rows, dtype=np.int32), 1, constant_values=-1)
         moments = np.full(0 if layout.config.get(BendingTerm) is None else layout.rows + 2, -1, np.int32)
-        self.arrays = SheetArrays(layout, np.concatenate([buffer, buffer, moments]), start)
+        self.arrays = SheetArrays(layout, np.concatenate([buffer_rows, buffer_rows, moments]), start)
 
     def advance(self, count: int, table: NDArray[Any]) -> None:
         with compilation_options():
-            self._advance(self._now, count, self._layout.rows, self._layout.cols, table, *self.arrays.all)
-        self._now = (self._now + count) % 2
-        self._top_row = self._now * (self._layout.rows + 2) + 1
+            self._advance(self._buffer, count, self._layout.rows, self._layout.cols, table, *self.arrays.all)
+        self._buffer = (self._buffer + count) % 2
+        self._top_row = self._buffer * (self._layout.rows + 2) + 1
 
     def compile(self, table: NDArray[Any]) -> None:
         self.advance(0, table)
 
 
 def _build_step(config: KernelConfig) -> Callable[..., None]:
+    """Build the Taichi function that steps a mass point."""
     real, vector, columns, springs = config.real, config.vector, config.first_column(None), config.require(SpringTerm)
     structural, shear, open_edges = springs.structural, springs.shear, springs.open_edges
     row_share, column_share = springs.build_cell_shares(config)
@@ -61,7 +62,7 @@ def _build_step(config: KernelConfig) -> Callable[..., None]:
     resolving = [correction.resolve for correction in corrections if correction]
 
     @ti.func
-    def by_row(sheet: ti.template(), p, q, lower, b, row_exists, up):
+    def row_force(sheet: ti.template(), p, q, lower, b, row_exists, up):
         """Return the force of entry b of row p on row q, `up` [m] above, summed in the order of the CPU kernel."""
         u, dx = [sheet.u[c][p * sheet.width + b] for c in ti.static(range(3))], sheet.constants[DX]
         force = [vector(0) for _ in ti.static(range(3))]
@@ -82,7 +83,8 @@ def _build_step(config: KernelConfig) -> Callable[..., None]:
         return force
 
     @ti.func
-    def by_right(sheet: ti.template(), p, i, kind, b):
+    def right_force(sheet: ti.template(), p, i, kind, b):
+        """Return the force of entry b of row p, which is row i of the sheet, on its right neighbour."""
         exists, entry = vector(1), p * sheet.width + b
         if ti.static(open_edges):
             exists = sheet.by_column[HAS_RIGHT * sheet.width + b]
@@ -90,30 +92,30 @@ def _build_step(config: KernelConfig) -> Callable[..., None]:
         return force_on_right(sheet, entry + 1, u, k, row_share(exists, kind))
 
     @ti.func
-    def step(sheet: ti.template(), loads: ti.template(), now, i, b, n):
-        """Step mass point (i, b - 1) from buffer `now`, with row n of the load table."""
+    def step(sheet: ti.template(), loads: ti.template(), buffer, i, b, n):
+        """Step mass point (i, b - 1), from a buffer into the other one, with row n of the load table."""
         rows, width = sheet.rows, sheet.width
-        p = now * (rows + 2) + i + 1
+        p = buffer * (rows + 2) + i + 1
         kind = ti.select(i == rows - 1, 2, ti.select(i == 0, 0, 1))
         below, above = ti.cast(i < rows - 1, real), ti.cast(i > 0, real)
         dy = sheet.constants[DY]
-        on_below = by_row(sheet, p, p + 1, i + 1, b, below, 0 - dy)
-        on_above = by_row(sheet, p, p - 1, i, b, above, dy)
+        on_below = row_force(sheet, p, p + 1, i + 1, b, below, 0 - dy)
+        on_above = row_force(sheet, p, p - 1, i, b, above, dy)
         force = [0 - (on_below[c] + on_above[c]) for c in ti.static(range(3))]
         if ti.static(structural):
-            on_right = by_right(sheet, p, i, kind, b)
-            of_left = by_right(sheet, p, i, kind, b - 1)
+            on_right = right_force(sheet, p, i, kind, b)
+            of_left = right_force(sheet, p, i, kind, b - 1)
             for c in ti.static(range(3)):
                 force[c] += of_left[c] - on_right[c]
-        row = [loads[n, c] for c in ti.static(range(columns))]
+        now = [loads[n, c] for c in ti.static(range(columns))]
         u = [sheet.u[c][p * width + b] for c in ti.static(range(3))]
         before, at, after = 2 * (rows + 2) + i, 2 * (rows + 2) + i + 1, 2 * (rows + 2) + i + 2
         line = ti.static(KernelRow(i, kind, before, at, after))
         entry = ti.static(Entry(line, b, u))
-        target = (1 - now) * (rows + 2) + i + 1
-        move(sheet, entry, target, force, row)
+        target = (1 - buffer) * (rows + 2) + i + 1
+        move(sheet, entry, target, force, now)
         for resolve in ti.static(resolving):
-            resolve(sheet, i, kind, target, b, row)
+            resolve(sheet, i, kind, target, b, now)
 
     return step
 
@@ -127,7 +129,7 @@ def _build_advance(config: KernelConfig) -> Callable[..., None]:
 
     @ti.kernel
     def advance(
-        now: ti.i32, count: ti.i32, rows: ti.i32, cols: ti.i32, loads: ti.types.ndarray(dtype=real, ndim=2),
+        buffer: ti.i32, count: ti.i32, rows: ti.i32, cols: ti.i32, loads: ti.types.ndarray(dtype=real, ndim=2),
         u_x: vectors, u_y: vectors, u_z: vectors,
         d_x: vectors, d_y: vectors, d_z: vectors,
         constants_of: ti.types.ndarray(dtype=vector, ndim=1), by_column: vectors, stiffness: vectors, fields: vectors,
@@ -135,7 +137,7 @@ def _build_advance(config: KernelConfig) -> Callable[..., None]:
         """Advance by the steps of a launch.
 
         Args:
-            now: index of the buffer of u_n, 0 or 1.
+            buffer: index of the buffer with u_n, 0 or 1.
             count: number of steps, at most STEPS_PER_LAUNCH.
             rows: number of rows of the sheet.
             cols: number of columns of the sheet.
@@ -149,13 +151,13 @@ def _build_advance(config: KernelConfig) -> Callable[..., None]:
                         constants = [constants_of[m][0] for m in ti.static(range(constant_count))]
                         u, d = ti.static((u_x, u_y, u_z), (d_x, d_y, d_z))
                         sheet = ti.static(KernelSheet(u, d, by_column, stiffness, fields, constants, rows, cols + 2))
-                        p = (now + n) % 2 * (rows + 2) + i + 1
+                        p = (buffer + n) % 2 * (rows + 2) + i + 1
                         store_moment(sheet, i, p - 1, p, p + 1, b, 2 * (rows + 2) + i + 1)
             for i, b in ti.ndrange(rows, (1, cols + 1)):
                 if n < count:
                     constants = [constants_of[m][0] for m in ti.static(range(constant_count))]
                     u, d = ti.static((u_x, u_y, u_z), (d_x, d_y, d_z))
                     sheet = ti.static(KernelSheet(u, d, by_column, stiffness, fields, constants, rows, cols + 2))
-                    step(sheet, loads, (now + n) % 2, i, b, n)
+                    step(sheet, loads, (buffer + n) % 2, i, b, n)
 
     return advance

@@ -32,29 +32,37 @@ from taichi_msm.solver.arrays import (
     SheetArrays,
     SheetKernel,
     SheetLayout,
+    build_point_forces,
     build_read,
-    point_forces,
     to_lanes,
 )
-from taichi_msm.solver.bands import MOMENT_ROWS, RowBand, build_join_strips, build_step_row
+from taichi_msm.solver.bands import MOMENT_ROWS, RowBand, build_fill_halo, build_step_row
 from taichi_msm.system.runtime import compilation_options, ti, write_vectors
 from taichi_msm.terms.base import MOBILITY, Entry, KernelConfig, KernelRow, KernelSheet, RestCorrection
 from taichi_msm.terms.bending import BendingTerm
 from taichi_msm.terms.springs import SpringTerm
 
-# Arguments of a launch: rows of the sheet; columns of a strip; the first row that is not fixed, and the row after the
-# last; the largest number of evaluations; the squared force tolerance [N^2]; whether tools or mass points were placed
-# since the last launch. State of FIRE: the step dt; the share a; the number of consecutive evaluations with positive
-# power. Results: the number of evaluations; of the last one the squared largest force [N^2], and the sum of F^2 / M,
-# which is not finite if any force is NaN.
-ROWS, STRIP, FIRST_ROW, END_ROW, COUNT, SQUARED_TOLERANCE, PLACED, STEP, SHARE, POSITIVE_COUNT = range(10)
+# Arguments of a launch
+#   ROWS, STRIP         rows of the sheet; columns of a strip
+#   FIRST_ROW, END_ROW  the first row that is not fixed; the row after the last one
+#   COUNT               largest number of evaluations
+#   SQUARED_TOLERANCE   square of the force tolerance [N^2]
+#   PLACED              1 if tools or mass points were placed since the last launch, else 0
+# State of FIRE
+#   STEP, MIXING        the step dt; the mixing factor a
+#   POSITIVE_COUNT      number of consecutive evaluations with positive power
+# Results
+#   EVALUATIONS         number of evaluations
+#   LARGEST             square of the largest force at the last evaluation [N^2]
+#   FORCE_SUM           sum of F^2 / M at the last evaluation, not finite if any force is NaN
+ROWS, STRIP, FIRST_ROW, END_ROW, COUNT, SQUARED_TOLERANCE, PLACED, STEP, MIXING, POSITIVE_COUNT = range(10)
 EVALUATIONS, LARGEST, FORCE_SUM, NUMBERS = range(10, 14)
 
-# Reductions of an evaluation: the sums of F q / M, F^2 / M and q^2 / M; the squared largest force.
-POWER, SQUARED_FORCE, MOTION, SQUARE, SUMS = range(5)
+# Reductions of an evaluation: the sums of F q / M, F^2 / M and q^2 / M; the square of the largest force.
+POWER, SQUARED_FORCE, MOTION, MAX_SQUARE, SUMS = range(5)
 
-# Initial share a and its decay; factors of the step; number of evaluations with positive power before the step grows.
-FIRST_SHARE, SHARE_DECAY, SHRINK, GROW, DELAY = 0.25, 0.99, 0.9, 1.1, 10
+# Initial mixing factor and its decay; factors of the step; evaluations with positive power before the step grows.
+FIRST_MIXING, MIXING_DECAY, SHRINK, GROW, DELAY = 0.25, 0.99, 0.9, 1.1, 10
 
 INFINITE = float("inf")
 
@@ -94,10 +102,11 @@ class Relaxation(SheetKernel):
         self._relax, self._scale_kernel = _build_relax(layout.config), _build_scale(layout.config)
         self._read = build_read(layout.config, parallel=False, iterations=1)
         moments = 0 if layout.config.get(BendingTerm) is None else MOMENT_ROWS
-        # The sheet's rows, moments, and the forces carried to the next row.
-        self._stored = np.concatenate([np.arange(layout.rows, dtype=np.int32), np.full(moments + 1, -1, np.int32)])
-        self.arrays = arrays = SheetArrays(layout, self._stored, start)
-        self._q, self._work = [arrays.rows(layout.rows) for _ in range(3)], arrays.rows(layout.rows + SUMS)
+        # After the rows of the sheet, u contains rows of moments and a row of the forces carried to the next row.
+        sheet_rows = np.concatenate([np.arange(layout.rows, dtype=np.int32), np.full(moments + 1, -1, np.int32)])
+        self.arrays = SheetArrays(layout, sheet_rows, start)
+        self._q = [self.arrays.allocate_rows(layout.rows) for _ in range(3)]
+        self._work = self.arrays.allocate_rows(layout.rows + SUMS)
         write_vectors(self._work, to_lanes(layout, 1 / masses))
         first_fixed, last_fixed = layout.fixed_rows
         self._fire = np.zeros(NUMBERS)
@@ -105,17 +114,15 @@ class Relaxation(SheetKernel):
         self.stop()
 
     def stop(self) -> None:
-        """Set all momenta to 0 and reset the state of FIRE."""
+        """Stop all mass points and reset the state of FIRE."""
         for q in self._q:
             write_vectors(q, np.zeros((0, self._layout.config.lanes)))
-        self._fire[[STEP, SHARE, POSITIVE_COUNT, PLACED]] = LARGEST_STEP, FIRST_SHARE, 0, 1
+        self._fire[[STEP, MIXING, POSITIVE_COUNT, PLACED]] = LARGEST_STEP, FIRST_MIXING, 0, 1
 
     def place(self, displacement: NDArray[Any]) -> None:
         """Set the displacements [m], shape (rows, cols, 3)."""
-        held = (self._stored >= 0)[:, None]
         self._fire[PLACED] = 1
-        for c in range(3):
-            write_vectors(self.arrays.u[c], to_lanes(self._layout, np.where(held, displacement[self._stored, :, c], 0)))
+        self.arrays.set_displacement(displacement)
 
     def relax(self, count: int, tolerance: float, row: NDArray[Any]) -> tuple[int, float]:
         """Evaluate the forces and move the mass points until no force exceeds a tolerance.
@@ -149,11 +156,12 @@ def _corrections(config: KernelConfig) -> list[RestCorrection]:
 
 def _build_store(config: KernelConfig) -> Callable[..., None]:
     """Build the Taichi function that stores the force on an entry and adds to the reductions of FIRE."""
-    vector, forces = config.vector, point_forces(config)
+    vector, forces = config.vector, build_point_forces(config)
     removals = [correction.remove for correction in _corrections(config)]
 
     @ti.func
     def store(sheet: ti.template(), entry: ti.template(), _target, force: ti.template(), now: ti.template()):
+        """Store `force`, that of springs, plus those of all other terms, and reduce the part that no tool carries."""
         for add in ti.static(forces):
             add(force, sheet, entry, now)
         width, at = sheet.width, entry.row.i * sheet.width + entry.b
@@ -174,7 +182,7 @@ def _build_store(config: KernelConfig) -> Callable[..., None]:
             # `+=` on an array would be atomic.
             place = (sheet.rows + n) * width + entry.b
             sheet.work[place] = sheet.work[place] + term * inverse
-        place = (sheet.rows + SQUARE) * width + entry.b
+        place = (sheet.rows + MAX_SQUARE) * width + entry.b
         sheet.work[place] = ti.max(sheet.work[place], square)
 
     return store
@@ -184,14 +192,15 @@ def _build_store(config: KernelConfig) -> Callable[..., None]:
 def _build_relax(config: KernelConfig) -> Callable[..., None]:
     """Build the kernel that evaluates forces and moves mass points."""
     real, vector, vectors, lanes = config.real, config.vector, config.vectors, config.lanes
-    constant_count, join_strips = config.first_constant(None), build_join_strips(config)
-    pass_row = build_step_row(config, _build_store(config), corrects=False, parallel=False)
+    constant_count, fill_halo = config.first_constant(None), build_fill_halo(config)
+    step_row = build_step_row(config, _build_store(config), corrects=False, parallel=False)
     moments = 0 if config.get(BendingTerm) is None else MOMENT_ROWS
     columns, corrections = config.first_column(None), _corrections(config)
     removals, projections = [each.remove for each in corrections], [each.project for each in corrections]
 
     @ti.func
     def add_up(sheet: ti.template(), n: ti.template()):
+        """Return the sum of reduction n over all columns."""
         total = ti.cast(0, real)
         for lane in ti.static(range(lanes)):
             for b in range(1, sheet.width - 1):
@@ -200,10 +209,11 @@ def _build_relax(config: KernelConfig) -> Callable[..., None]:
 
     @ti.func
     def evaluate(sheet: ti.template(), row: ti.template(), band: ti.template()):
+        """Evaluate the forces on all mass points and their reductions."""
         for n in range(sheet.rows * sheet.width, (sheet.rows + SUMS) * sheet.width):
             sheet.work[n] = vector(0)
         for line in range(-1, band.high - band.low):
-            pass_row(sheet, sheet.u, row, band, line, 0, 0, sheet.rows + moments, sheet.rows)
+            step_row(sheet, sheet.u, row, band, line, 0, 0, sheet.rows + moments, sheet.rows)
 
     @ti.func
     def move_points(sheet: ti.template(), row: ti.template(), band: ti.template(), keep, gain, dt, back):
@@ -234,7 +244,7 @@ def _build_relax(config: KernelConfig) -> Callable[..., None]:
             for b in range(1, sheet.width - 1):
                 for project_out in ti.static(projections):
                     project_out(sheet, i, kind, b, now)
-        join_strips(sheet.u, i, sheet.width)
+        fill_halo(sheet.u, i, sheet.width)
 
     @ti.kernel
     def relax(
@@ -274,7 +284,7 @@ def _build_relax(config: KernelConfig) -> Callable[..., None]:
                 power, force_sum, motion = add_up(sheet, POWER), add_up(sheet, SQUARED_FORCE), add_up(sheet, MOTION)
                 largest = ti.cast(0, real)
                 for b in range(1, width - 1):
-                    largest = ti.max(largest, sheet.work[(rows + SQUARE) * width + b].max())
+                    largest = ti.max(largest, sheet.work[(rows + MAX_SQUARE) * width + b].max())
                 fire[LARGEST] = largest
                 fire[FORCE_SUM] = force_sum
                 # With NaN the comparison is False and ends the loop.
@@ -285,20 +295,20 @@ def _build_relax(config: KernelConfig) -> Callable[..., None]:
                         fire[POSITIVE_COUNT] = fire[POSITIVE_COUNT] + 1
                         if fire[POSITIVE_COUNT] > DELAY:
                             fire[STEP] = ti.min(fire[STEP] * GROW, LARGEST_STEP)
-                            fire[SHARE] = fire[SHARE] * SHARE_DECAY
-                        keep = 1 - fire[SHARE]
+                            fire[MIXING] = fire[MIXING] * MIXING_DECAY
+                        keep = 1 - fire[MIXING]
                     else:
                         if motion > 0:
                             fire[STEP] = ti.max(fire[STEP] * SHRINK, SMALLEST_STEP)
                         fire[POSITIVE_COUNT] = 0
-                        fire[SHARE] = FIRST_SHARE
+                        fire[MIXING] = FIRST_MIXING
                         back = fire[STEP] / 2
                     dt = fire[STEP]
                     gain = dt
                     if power > 0:
                         # |q + dt F| / |F|, with norms weighted with 1 / M.
                         norm_ratio = ti.sqrt((motion + 2 * dt * power + dt * dt * force_sum) / force_sum)
-                        gain = keep * dt + fire[SHARE] * norm_ratio
+                        gain = keep * dt + fire[MIXING] * norm_ratio
                     move_points(sheet, row, band, keep, gain, dt, back)
             fire[EVALUATIONS] = evaluations
 
@@ -307,7 +317,7 @@ def _build_relax(config: KernelConfig) -> Callable[..., None]:
 
 @cache
 def _build_scale(config: KernelConfig) -> Callable[..., None]:
-    """Build the kernel that squares the largest force of a spring, a load or the foundation on a mass point."""
+    """Build the kernel of `Relaxation.scale`."""
     real, vector, vectors, columns = config.real, config.vector, config.vectors, config.first_column(None)
     constant_count = config.first_constant(None)
     max_spring_force = config.require(SpringTerm).build_max_spring_force(config)
@@ -323,12 +333,12 @@ def _build_scale(config: KernelConfig) -> Callable[..., None]:
         d_x: vectors, d_y: vectors, d_z: vectors,
         constants_of: ti.types.ndarray(dtype=vector, ndim=1), by_column: vectors, stiffness: vectors, fields: vectors,
     ):  # fmt: skip
-        """Square the largest force of a spring, a load or the foundation on a mass point.
+        """Compute the square of the largest force of a spring, a load or the foundation on a mass point.
 
         Args:
             rows: number of rows of the sheet.
             width: number of entries of a row.
-            result: output [N2], shape (1,).
+            result: output, the square [N^2], shape (1,).
             row: row of the load table, shape (1, columns).
             u_x, u_y, u_z, d_x, d_y, d_z, constants_of, by_column, stiffness, fields: `SheetArrays.all`.
         """

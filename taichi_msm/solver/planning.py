@@ -32,7 +32,7 @@ from taichi_msm.model.sheet import (
     tissue_problems,
 )
 from taichi_msm.model.time_grid import TimeGrid
-from taichi_msm.model.tools import Tool, build_tools, friction_problem, path_problems, too_fast
+from taichi_msm.model.tools import Tool, build_tools, friction_problem, path_problems, speed_problem
 from taichi_msm.model.verlet import stability_limit
 from taichi_msm.scene.scene import Scene, Time
 from taichi_msm.scene.section import FRAME_TOLERANCE
@@ -55,11 +55,11 @@ ENCODING_WORK, SAMPLE_WORK = 40.0, 6.0
 # Number of evaluations of the forces for a quasi-static frame, per row and column.
 EVALUATIONS_PER_LINE = 2.0
 
-# `precision: auto` chooses f64 if stepping takes at most this share of the work of everything else.
-MAX_F64_SHARE = 0.25
+# `precision: auto` chooses f64 if stepping takes at most this fraction of the work of everything else.
+MAX_F64_FRACTION = 0.25
 
-# Largest share of companion runs in the work of a run, unless the user requests them.
-MAX_COMPANION_SHARE = 2 / 5
+# Largest work of companion runs that the user does not request, as a fraction of all work of a run.
+MAX_COMPANION_FRACTION = 2 / 5
 
 # Range of lengths whose squares, and products of squares, f32 can represent [m].
 MIN_F32_LENGTH_M, MAX_F32_LENGTH_M = 1e-15, 1e17
@@ -78,34 +78,26 @@ class Work(NamedTuple):
 
 
 def count_work(plan: Plan, companions: float) -> Work:
-    """Estimate the work of a run.
+    """Return the estimated work of a run by stages [f32 steps of a mass point].
 
     Args:
         plan: plan of the run.
         companions: work of its companion runs [f64 steps of the sheet per step of the run].
-
-    Returns:
-        Work by stages [f32 steps of a mass point].
     """
     steps = _stepping_work(plan)
     stepping = F64_WORK * steps if plan.grid.precision == "f64" else steps
     return Work(START_WORK, stepping, F64_WORK * companions * steps, _other_work(plan.scene) - START_WORK)
 
 
-def is_f64_cheap(plan: Plan) -> bool:
-    """Return whether stepping in f64 is a small part of the work of a run."""
-    return F64_WORK * _stepping_work(plan) <= MAX_F64_SHARE * _other_work(plan.scene)
-
-
 def affords_companions(plan: Plan, companions: float) -> bool:
-    """Return whether companion runs take at most MAX_COMPANION_SHARE of the work of a run.
+    """Return whether companion runs take at most MAX_COMPANION_FRACTION of the work of a run.
 
     Args:
         plan: plan of the run.
         companions: work of the companion runs [f64 steps of the sheet per step of the run].
     """
     work = count_work(plan, companions)
-    return work.companions <= MAX_COMPANION_SHARE * sum(work)
+    return work.companions <= MAX_COMPANION_FRACTION * sum(work)
 
 
 def _stepping_work(plan: Plan) -> float:
@@ -123,20 +115,13 @@ def _other_work(scene: Scene) -> float:
     return START_WORK + pixels * (ENCODING_WORK + SAMPLE_WORK * scene.render.supersample**2)
 
 
-def make_plan(scene: Scene, maps: Maps | None = None) -> Plan:
-    """Build the plan of a scene for a CPU, as `try_plan`.
-
-    Args:
-        scene: a scene whose keys are valid individually.
-        maps: images of its stiffness maps; by default they are read.
-
-    Returns:
-        Plan of the run.
+def make_plan(scene: Scene) -> Plan:
+    """Return the plan of a scene for a CPU.
 
     Raises:
         SceneError: when sheet, steps or paths are invalid; it lists all problems.
     """
-    plan, problems = try_plan(scene, maps)
+    plan, problems = try_plan(scene)
     if plan is None or problems:
         raise SceneError([str(problem) for problem in problems])
     return plan
@@ -146,11 +131,11 @@ def try_plan(scene: Scene, maps: Maps | None = None) -> tuple[Plan | None, list[
     """Build the plan of a scene for a CPU and check sheet, steps and paths.
 
     Args:
-        scene: a scene whose keys are valid individually.
-        maps: images of its stiffness maps; by default they are read.
+        scene: scene with valid keys; checks across keys may still fail.
+        maps: images of its stiffness maps; by default read from their files.
 
     Returns:
-        The plan, None if the material is invalid; and all problems.
+        The plan, or None with an invalid material, and all problems.
     """
     problems = list(material_key_problems(scene))
     if problems:
@@ -167,14 +152,11 @@ def try_plan(scene: Scene, maps: Maps | None = None) -> tuple[Plan | None, list[
 
 
 def plan_variant(plan: Plan, scene: Scene) -> Plan:
-    """Build the plan of a modified scene without checks.
+    """Return the plan of a modified scene, without checks.
 
     Args:
         plan: plan of the original scene, whose maps are reused.
-        scene: the modified scene, which must be valid.
-
-    Returns:
-        Plan of the modified scene.
+        scene: the modified scene, known to be valid.
     """
     return _plan(scene, plan.maps, fixed_points(scene.sheet), derive_material(scene, plan.maps))
 
@@ -212,7 +194,8 @@ def choose_precision(plan: Plan, arch: str) -> Plan:
         return plan.with_grid(precision="f64")
     if time.precision != "auto":
         return plan.with_grid(precision=time.precision)
-    in_f64 = arch == "cpu" and (time.tolerance is not None or is_f64_cheap(plan))
+    f64_is_cheap = F64_WORK * _stepping_work(plan) <= MAX_F64_FRACTION * _other_work(plan.scene)
+    in_f64 = arch == "cpu" and (time.tolerance is not None or f64_is_cheap)
     return plan.with_grid(precision="f64" if in_f64 else "f32")
 
 
@@ -227,7 +210,7 @@ def stable_step(material: Material, sheet: Sheet, difference: str) -> float:
     return stability_limit(highest_frequency(material, sheet), material.drag, difference)
 
 
-def stable_steps(plan: Plan) -> int:
+def min_stable_steps(plan: Plan) -> int:
     """Return the smallest stable number of steps per frame."""
     return max(1, math.ceil(1 / plan.grid.frames_per_second / plan.stable_step * ROUNDING_MARGIN))
 
@@ -235,8 +218,8 @@ def stable_steps(plan: Plan) -> int:
 def steps_per_frame(time: Time, limit: float) -> int:
     """Return the number of steps per frame; 1 in quasi-static scenes.
 
-    With `auto`, it is the smallest number whose step is at most half the limit. A given step is rounded to a fraction
-    of a frame. `accuracy.time_step` increases the number for a tolerance.
+    With `auto`, it is the smallest number whose step is at most half the limit; `accuracy.time_step` increases it for
+    a tolerance. A given step is rounded to a frame divided by a whole number.
 
     Args:
         time: section `time` of the scene.
@@ -263,7 +246,8 @@ def with_time(scene: Scene, **changes: Any) -> Scene:
 def freeze_grid(plan: Plan) -> Plan:
     """Write the chosen precision, and the step chosen for a tolerance, into the scene of a plan.
 
-    Every plan of this scene then has the same grid on any arch. A step that follows from the scene stays "auto".
+    Every plan of this scene then has the same grid on any arch. Without a tolerance the step is left as it is, because
+    it follows from the scene.
     """
     changes: dict[str, Any] = {"precision": plan.grid.precision}
     if plan.scene.time.tolerance is not None:
@@ -272,12 +256,10 @@ def freeze_grid(plan: Plan) -> Plan:
 
 
 def _step_problems(plan: Plan) -> Iterator[Problem]:
-    if plan.scene.time.at_rest:
-        return
     given, limit, frame = plan.scene.time.step, plan.stable_step, 1 / plan.grid.frames_per_second
-    if given == "auto":
-        pass
-    elif given > limit * (1 + 1e-12):
+    if plan.scene.time.at_rest or given == "auto":
+        return
+    if given > limit * (1 + 1e-12):
         below = frame / math.ceil(frame / limit)
         text = f"{given:g} s is above the stability limit {limit:.6g} s; try {below:.9g}, or auto"
         yield Problem(("time", "step"), text)
@@ -314,7 +296,7 @@ def steer_plan(plan: Plan, probes: Sequence[Probe | Mapping[str, Any] | None], n
 
     Args:
         plan: plan of the run.
-        probes: one item per probe of the plan. None, or the current probe, leaves the probe unchanged. The `path` of a
+        probes: one item per probe of the plan; None or the current probe for no change. The `path` of a
             position-controlled tool contains only keyframes after `now`; a mapping may omit its instrument, friction
             and grips, which then stay the same.
         now: the current time [s].
@@ -343,11 +325,11 @@ def steer_plan(plan: Plan, probes: Sequence[Probe | Mapping[str, Any] | None], n
 
 
 def with_current_paths(plan: Plan, probes: Sequence[Probe]) -> Plan:
-    """Return a plan with other position-controlled tools.
+    """Return a plan with the position-controlled tools of other probes.
 
     Args:
         plan: plan of the run.
-        probes: one probe per probe of the plan, of which those that are position-controlled replace the plan's.
+        probes: one probe per probe of the plan; force-controlled ones are ignored.
     """
     if not plan.tools:
         return plan
@@ -366,7 +348,7 @@ def _fill_omitted_keys(before: Probe, given: Probe | Mapping[str, Any] | None) -
 
 
 def _join_paths(plan: Plan, before: Probe, given: Probe, now: float) -> tuple[Probe, int]:
-    """Return a probe whose path also has the past keyframes on which later steps depend, and the index of the last."""
+    """Return the given probe with past keyframes that later steps need before its path, and the last one's index."""
     assert before.path is not None
     assert given.path is not None
     tolerance = FRAME_TOLERANCE / plan.grid.frames_per_second
@@ -397,7 +379,7 @@ def _path_problems(plan: Plan, index: int, before: Probe, given: Probe, now: flo
     (old_tool,), (tool,) = build_tools((before,), sheet), build_tools((joined,), sheet)
     if problem := friction_problem(tool, at_rest=at_rest):
         yield Problem((*key, "friction"), problem)
-    if not at_rest and (fault := too_fast(tool, plan.grid, first)):
+    if not at_rest and (fault := speed_problem(tool, plan.grid, first)):
         yield Problem((*key, "path", fault[0] - first - 1), fault[1])
     deviation = _shape_change(old_tool, tool)
     if deviation > tool.stride_limit:

@@ -33,7 +33,7 @@ from taichi_msm.model.sheet import rest_positions
 from taichi_msm.model.tools import Clamp
 from taichi_msm.scene.section import MIN_MAGNITUDE
 from taichi_msm.solver.arrays import InitialData, SheetLayout
-from taichi_msm.solver.dynamics import Dynamics
+from taichi_msm.solver.dynamics import POINT_STEPS_PER_LAUNCH, Dynamics
 from taichi_msm.solver.kernel_rest import Relaxation
 from taichi_msm.solver.sheet_solver import SheetSolver
 from taichi_msm.solver.state import Reading, State, largest_displacement
@@ -55,7 +55,7 @@ Array = NDArray[np.float64]
 
 
 class QuasiStatics(SheetSolver[Relaxation]):
-    """The sheet in quasi-static motion, stepped by a single worker of a CPU.
+    """The sheet in quasi-static motion, solved by a single worker of a CPU.
 
     Attributes:
         evaluations: number of evaluations of the forces for the last frame.
@@ -128,24 +128,25 @@ class QuasiStatics(SheetSolver[Relaxation]):
         self.kernel.arrays.set_fields(self.layout.config.first_field(ContactTerm), memory)
 
     def _settle(self, frame: int, pause: Pause) -> None:
+        """Find the equilibrium of a frame from that of the previous frame, through intermediate shapes."""
         self.evaluations = 0
-        relaxation, before, loads = self.kernel, self.state(), evaluate_frame_loads(self.plan, frame)
+        before, loads = self.state(), evaluate_frame_loads(self.plan, frame)
         tools, contact_before = self.plan.tools, before.memory[self.layout.config.memory_slice(ContactTerm)]
         contact = contact_rest.memory_after_grips(self.plan, frame, before.displacement, contact_before)
-        held_before, held = contact_rest.is_gripping(tools, contact_before), contact_rest.is_gripping(tools, contact)
+        gripped_before, grips = (contact_rest.is_gripping(tools, memory) for memory in (contact_before, contact))
         if tools:
             self._write_contact(contact)
         if self._interrupted:
-            relaxation.place(before.displacement)
+            self.kernel.place(before.displacement)
         self._interrupted, residual, rough = True, 0.0, any(tool.rough for tool in tools)
-        *_, end = times = self._shape_times(frame)
+        times = self._shape_times(frame)
         for start, time in pairwise(times):
             row = self._load_table(loads, frame)
             contact_rest.set_tools(self.plan, frame, time, row[0, self._contact_column :])
-            # After a release the flat shape is tried even if a tool is in the way.
-            free = not (loads.strength.any() or held or self._is_clamp_displaced(time))
-            free = free and (held_before or not self._meets_tool(time))
-            tolerance = FORCE_TOLERANCE if time == end else PERTURBATION_TOLERANCE
+            # After the end of a grip the flat shape is tried even if a tool touches the sheet.
+            free = not (loads.strength.any() or grips or self._is_clamp_displaced(time))
+            free = free and (gripped_before or not self._meets_tool(time))
+            tolerance = FORCE_TOLERANCE if time == times[-1] else PERTURBATION_TOLERANCE
             if rough:
                 self._stick(frame, (start, time), row, pause)
             pull = math.inf
@@ -164,11 +165,11 @@ class QuasiStatics(SheetSolver[Relaxation]):
             self.kernel.relax(1, math.inf, row)
 
     def _stick(self, frame: int, times: tuple[float, float], row: NDArray[Any], pause: Pause) -> None:
-        """Let the mass points stick that rough tools reach between the current shape and the next one."""
+        """Stick mass points to the rough tools that reach them between the current shape and the next one."""
         plan, memory, start = self.plan, self._read_contact(), self._read_arrays(differences=False)[0]
         after = contact_rest.stick(plan, memory, start, start, times)
         if contact_rest.stuck_points(plan, memory).any() and (after != memory).any():
-            # To second order, mass points move as on a sheet that no further tool touches until they stick.
+            # Until they stick, mass points move like a sheet without further contact, with an error of second order.
             smooth = contact_rest.without_rough_tools(plan, row, self._contact_column)
             self._relax(frame, smooth, PERTURBATION_TOLERANCE, pause)
             after = contact_rest.stick(plan, memory, start, self._read_arrays(differences=False)[0], times)
@@ -199,7 +200,7 @@ class QuasiStatics(SheetSolver[Relaxation]):
         return any(clamp.tip_centre(np.array([time])).any() for clamp in clamps)
 
     def _try_flat(self, row: NDArray[Any]) -> bool:
-        """Return whether the flat shape is an equilibrium; if so, keep it."""
+        """Take the flat shape if it is an equilibrium; return whether it is."""
         relaxation, shape = self.kernel, self._read_arrays(differences=False)[0]
         relaxation.place(np.zeros_like(shape))
         count, force = relaxation.relax(1, 0.0, row)
@@ -209,40 +210,41 @@ class QuasiStatics(SheetSolver[Relaxation]):
         return force == 0
 
     def _shape_times(self, frame: int) -> list[float]:
-        """Return the times of the frame before, of the intermediate shapes, and of a frame [s]."""
+        """Return the times of the previous frame, of the intermediate shapes and of a frame [s]."""
         rate = self.plan.grid.frames_per_second
         begin, end = max(0, frame - 1) / rate, frame / rate
         times = {float(time) for tool in self.plan.tools for time in tool.substep_times(begin, end)}
         return [begin, *sorted({end, *times})]
 
     def _relax(self, frame: int, row: NDArray[Any], tolerance: float, pause: Pause) -> float:
-        """Iterate until the residual, relative to the largest force, is below a tolerance; return it."""
-        relaxation, longer = self.kernel, max(self.layout.rows, self.layout.cols)
+        """Iterate until the residual is below a tolerance; return it, both relative to the largest force."""
+        relaxation, rows, cols = self.kernel, self.layout.rows, self.layout.cols
         relaxation.stop()
-        # About 0.1 s of one core at most.
-        per_launch = max(1, min(64, 40_000_000 // (self.layout.rows * self.layout.cols)))
-        limit, evaluations, perturbed = MAX_EVALUATIONS * longer, 0, tolerance >= PERTURBATION_TOLERANCE
-        scale, stability_limit = max(MIN_FORCE_N, relaxation.scale(row)), math.inf
+        per_launch = max(1, min(64, POINT_STEPS_PER_LAUNCH // (rows * cols)))
+        max_evaluations, evaluations = MAX_EVALUATIONS * max(rows, cols), 0
+        perturbed, stability_evaluations = tolerance >= PERTURBATION_TOLERANCE, math.inf
+        scale = max(MIN_FORCE_N, relaxation.scale(row))
         while True:
             # The first evaluation shows whether the sheet is already in equilibrium.
             is_first = evaluations == 0
             target = (tolerance if is_first or perturbed else PERTURBATION_TOLERANCE) * scale
-            count, force = relaxation.relax(1 if is_first else min(per_launch, limit - evaluations), target, row)
+            launched = 1 if is_first else min(per_launch, max_evaluations - evaluations)
+            count, force = relaxation.relax(launched, target, row)
             evaluations += count
             scale = max(MIN_FORCE_N, relaxation.scale(row))
             if force <= min(target, tolerance * scale):
                 converged = tolerance == FORCE_TOLERANCE
-                if converged and not is_first and evaluations < stability_limit and self._may_be_unstable():
-                    # An unstable equilibrium shows within these evaluations.
-                    tolerance, stability_limit = STABILITY_TOLERANCE, 4 * evaluations
+                if converged and not is_first and evaluations < stability_evaluations and self._may_be_unstable():
+                    # An instability shows within these evaluations.
+                    tolerance, stability_evaluations = STABILITY_TOLERANCE, 4 * evaluations
                     continue
                 self.evaluations += evaluations
                 return force / scale
             if tolerance == STABILITY_TOLERANCE and (
-                force > 10 * FORCE_TOLERANCE * scale or evaluations >= stability_limit
+                force > 10 * FORCE_TOLERANCE * scale or evaluations >= stability_evaluations
             ):
                 tolerance = FORCE_TOLERANCE
-            if not (force < np.inf and scale < np.inf) or evaluations >= limit:
+            if not (force < np.inf and scale < np.inf) or evaluations >= max_evaluations:
                 raise self._diverged(frame, force / scale, evaluations)
             if force <= target and not perturbed:
                 self._perturb(force)
@@ -259,7 +261,7 @@ class QuasiStatics(SheetSolver[Relaxation]):
         return compressed or bool(self._touched()[touching].any())
 
     def _perturb(self, force: float) -> None:
-        """Displace every mass point at random, reproducibly, by at most the displacement due to a force [N]."""
+        """Displace every mass point at random, reproducibly, at most by the displacement due to a force [N]."""
         rows, cols = self.layout.rows, self.layout.cols
         # This generator returns the same numbers in every version of NumPy.
         noise = 2 * np.random.RandomState(0).random_sample((rows, cols, 3)) - 1
@@ -284,10 +286,10 @@ class QuasiStatics(SheetSolver[Relaxation]):
         return DivergedError(message, frame, time, (row, column))
 
 
-def build_dynamics(
+def build_solver(
     plan: Plan, device: Device, layout: SheetLayout | None = None, cores: int | None = None
 ) -> SheetSolver[Any]:
-    """Build the dynamic or quasi-static solver of a plan.
+    """Build the solver of a plan, dynamic or quasi-static.
 
     Args:
         plan: plan of the run.
@@ -296,6 +298,6 @@ def build_dynamics(
         cores: largest number of CPU cores; by default all available cores.
 
     Returns:
-        Solver at rest; a quasi-static one finds the first frame in its first call of `advance`.
+        Solver with the sheet at rest; a quasi-static one finds the first frame in its first call of `advance`.
     """
     return (QuasiStatics if plan.scene.time.at_rest else Dynamics)(plan, device, layout, cores)

@@ -1,10 +1,10 @@
 """A row in a pass on a CPU: the forces of its springs, each evaluated once for both ends, and its step in place.
 
 Lane l of entry b of a row is column b - 1 of strip l. The neighbours of an entry are therefore the adjacent entries,
-and every operation is one vector instruction. The first and the last entry of a row are a halo: the entries at the
-opposite end of the strips, shifted by one lane. The force of a spring between this row and the next is added to this
-row and carried to the next row; the force of a spring along the row is carried to the next entry. No later row depends
-on the old displacements of this row, so it is stepped in place.
+and every operation is one vector instruction. The first and the last entry of a row are its halo: the last column of
+the previous strip and the first column of the next strip. The force of a spring between this row and the next is added
+to this row and carried to the next row; the force of a spring along the row is carried to the next entry. No later row
+depends on the old displacements of this row, so it is stepped in place.
 
 Contact with position-controlled tools is resolved afterwards, in the rows that the tools can reach.
 """
@@ -50,7 +50,7 @@ def build_pass_row(config: KernelConfig, move: Callable[..., None]) -> Callable[
             source: row of u with its displacements.
             next_row: row of u with the displacements of the next row of the pass.
             exists: 1, or 0 if the sheet has no next row.
-            up: distance of the next row along y [m].
+            up: y of the next row minus y of this row, at rest [m].
             loads: load table, shape (steps, columns).
             n: row of the load table.
             moving: whether to step the row.
@@ -81,7 +81,7 @@ def build_pass_row(config: KernelConfig, move: Callable[..., None]) -> Callable[
         # Read once, because the compiler must assume that stores to the arrays could change the table.
         now = [loads[n, c] for c in ti.static(range(columns))]
         for b in range(1, strip + 1):
-            # First the sum of the forces on the neighbours in the other row.
+            # Until the carried force is added, `force` is the force on the neighbours in the other row.
             force = [vector(0) for _ in ti.static(range(3))]
             for c in ti.static(range(3)):
                 # Neighbours are read again for every entry, because registers are too few to keep them.
@@ -123,7 +123,7 @@ def build_pass_row(config: KernelConfig, move: Callable[..., None]) -> Callable[
                     force[c] += left[c] - right[c]
                     left[c] = right[c]
             for c in ti.static(range(3)):
-                # Its old value was read with the previous entry.
+                # The previous entry has already read the old value.
                 carried[c][carry + b - 1] = last[c]
             if moving:
                 entry = ti.static(Entry(line, b, u))
@@ -163,11 +163,11 @@ def build_correct_row(config: KernelConfig, correction: Correction) -> Callable[
         # Smallest and largest displacements along y and z.
         least, most = [[sheet.u[c][at + 1] for c in ti.static((1, 2))] for _ in ti.static(range(2))]
         for b in range(2, sheet.width - 1):
-            for n in ti.static(range(2)):
-                value = sheet.u[n + 1][at + b]
-                least[n], most[n] = ti.min(least[n], value), ti.max(most[n], value)
-        low = [0 - max_lane(0.0 - least[n]) for n in ti.static(range(2))]
-        high = [max_lane(most[n]) for n in ti.static(range(2))]
+            for axis in ti.static(range(2)):
+                value = sheet.u[axis + 1][at + b]
+                least[axis], most[axis] = ti.min(least[axis], value), ti.max(most[axis], value)
+        low = [0 - max_lane(0.0 - least[axis]) for axis in ti.static(range(2))]
+        high = [max_lane(most[axis]) for axis in ti.static(range(2))]
         if reaches(sheet, i, low, high, now):
             for b in range(1, sheet.width - 1):
                 resolve(sheet, i, kind, i, b, now)

@@ -1,6 +1,6 @@
 """The common part of both solvers of a sheet: in motion (`dynamics`) and in quasi-static equilibrium (`rest`).
 
-It holds the arrays of a plan on a device, computes the load table of their steps, and reads and measures them.
+It holds the arrays of a plan on a device, computes the load table of the steps, and reads and measures the sheet.
 """
 
 from __future__ import annotations
@@ -16,7 +16,8 @@ from taichi_msm.errors import ArgumentError, DeviceError, MsmError, Pause
 from taichi_msm.model.loads import Schedule
 from taichi_msm.model.plan import Plan
 from taichi_msm.model.sheet import area_shares, axes, spacing
-from taichi_msm.solver.arrays import NUMBER_BYTES, InitialData, SheetKernel, SheetLayout
+from taichi_msm.model.time_grid import DTYPES
+from taichi_msm.solver.arrays import InitialData, SheetKernel, SheetLayout
 from taichi_msm.solver.state import Reading, State
 from taichi_msm.system.process import available_threads
 from taichi_msm.system.runtime import Device, lanes
@@ -26,20 +27,20 @@ from taichi_msm.terms.springs import MAX_STRAIN, MIN_STRAIN, SpringTerm
 
 Kernel = TypeVar("Kernel", bound=SheetKernel)
 
-# With fewer mass points per worker, an additional worker costs more waiting time than it saves.
+# Smallest number of mass points per worker; with fewer, an additional worker costs more waiting time than it saves.
 POINTS_PER_WORKER = 450
+
+# Size of a band that stays in the cache from one step to the next.
+CACHED_BAND_BYTES = 384 << 10
 
 
 def choose_layout(plan: Plan, device: Device, cores: int | None = None) -> SheetLayout:
-    """Choose the memory layout of a sheet, its division among workers, and the configuration of its kernels.
+    """Return the memory layout of a sheet, its division among workers, and the configuration of its kernels.
 
     Args:
         plan: plan of the run.
         device: device of the arrays.
         cores: largest number of CPU cores; by default all available cores.
-
-    Returns:
-        Layout of the sheet.
 
     Raises:
         DeviceError: when the device does not support the scene.
@@ -61,12 +62,13 @@ def choose_layout(plan: Plan, device: Device, cores: int | None = None) -> Sheet
     )
     if device.arch == "vulkan" and precision == "f64" and any(slot.moves for slot in plan.slots):
         raise DeviceError(
-            "--arch vulkan: has no exp in f64, which control points that move need; take time.precision: f32 without a "
-            "tolerance or an estimate of the error, or --arch cpu"
+            "--arch vulkan: control points that move need exp in f64, which Vulkan lacks; take time.precision: f32 "
+            "without a tolerance or an estimate of the error, or --arch cpu"
         )
-    # A pass over a band that exceeds the cache takes several steps while its rows are there. Per mass point it reads
-    # displacement, last difference and carried force, with three components each.
-    fits = workers == 0 or rows // workers * cols * 9 * NUMBER_BYTES[precision] <= 3 << 17
+    # A pass over a larger band takes several steps while a row is in the cache. Per mass point it reads displacement,
+    # last difference and carried force, with three components each.
+    point_bytes = 9 * DTYPES[precision].itemsize
+    fits = workers == 0 or rows // workers * cols * point_bytes <= CACHED_BAND_BYTES
     depth = 1 if fits or config.reach > 1 else 8
     return SheetLayout(rows, cols, workers, depth, fixed_rows, config)
 
@@ -103,7 +105,11 @@ class SheetSolver(ABC, Generic[Kernel]):
 
     @property
     def kernel(self) -> Kernel:
-        """The arrays of the sheet, with the kernels that move and read it; MsmError while a restart is incomplete."""
+        """The arrays of the sheet, with the kernels that move and read it.
+
+        Raises:
+            MsmError: when a restart was interrupted.
+        """
         if self._kernel is None:
             raise MsmError("interrupted while the sheet was restarted; restart the scene")
         return self._kernel
@@ -118,16 +124,13 @@ class SheetSolver(ABC, Generic[Kernel]):
         self.inconsistent = True
         self._begin(state)
         self.plan, self.layout = plan, self._given_layout or choose_layout(plan, self._device, self._cores)
-        self._real = np.dtype(np.float32 if self.layout.config.precision == "f32" else np.float64)
+        self._dtype = DTYPES[self.layout.config.precision]
         self._kernel: Kernel | None = None  # Frees its memory before the new arrays are allocated.
         self._kernel = self._build_kernel(plan, self.layout, _initial_data(plan, self.layout, state))
         self.inconsistent = False
 
     def steer(self, plan: Plan) -> None:
-        """Continue with other probes, with the same kernels and the same steps.
-
-        Args:
-            plan: a plan that differs in its probes only.
+        """Continue with a plan that differs in its probes only, with the same kernels and steps.
 
         Raises:
             ArgumentError: when the new probes require other kernels.
@@ -178,14 +181,11 @@ class SheetSolver(ABC, Generic[Kernel]):
         self._kernel = None
 
     def _load_table(self, loads: Schedule, first: int) -> NDArray[Any]:
-        """Compute the load table of consecutive steps, with a gain of 0.
+        """Return the load table of consecutive steps, with a gain of 0, shape (steps, columns).
 
         Args:
             loads: loads at the steps.
             first: number of the first step.
-
-        Returns:
-            Load table in the precision of the kernels, shape (steps, columns).
         """
         config = self.layout.config
         table = np.zeros((len(loads.active), config.first_column(None)))
@@ -194,14 +194,10 @@ class SheetSolver(ABC, Generic[Kernel]):
             table[:, column : column + term.column_count] = term.columns(self.plan, loads, first)
         # Loads too large for f32 become infinite; the next reading of the sheet detects it.
         with np.errstate(over="ignore"):
-            return table.astype(self._real)
+            return table.astype(self._dtype)
 
     def _measure(self, *, moving: bool) -> Reading:
-        """Read and measure the sheet.
-
-        Args:
-            moving: whether the energy includes the kinetic energy.
-        """
+        """Read and measure the sheet; with `moving`, the energy includes the kinetic energy."""
         displacement, measures = self._read_arrays(differences=False)
         config, plan = self.layout.config, self.plan
         springs = measures[:, config.first_measure(SpringTerm) :]
@@ -216,18 +212,20 @@ class SheetSolver(ABC, Generic[Kernel]):
         return Reading(self.steps_done, displacement, shortest, longest, energy / 2)
 
     def _read_arrays(self, *, differences: bool) -> tuple[NDArray[Any], NDArray[Any]]:
-        """Read displacements or last differences, see `SheetKernel.read`, and the measures of every row."""
+        """Read displacements or last differences, and measures of every row, see `SheetKernel.read`."""
         rows, cols, count = self.layout.rows, self.layout.cols, self.layout.config.first_measure(None)
-        values, measures = np.empty((rows, cols, 3), self._real), np.empty((rows, count), self._real)
+        values, measures = np.empty((rows, cols, 3), self._dtype), np.empty((rows, count), self._dtype)
         self.kernel.read(differences, values, measures)
         return values, measures
 
     def _read_memory(self) -> NDArray[Any]:
         """Read the numbers that terms remember, shape (numbers, rows, cols)."""
-        fields = [self.kernel.arrays.get_fields(n, 1) for n in self.layout.config.memory_fields]
-        # Only some kernels step fixed mass points, whose memory has no effect.
-        fields = [np.where(self.plan.fixed, 0, field).astype(self._real) for field in fields]
-        return np.concatenate([np.empty((0, self.layout.rows, self.layout.cols), self._real), *fields])
+        indices = self.layout.config.memory_fields
+        memory = np.empty((len(indices), self.layout.rows, self.layout.cols), self._dtype)
+        for field, index in zip(memory, indices, strict=True):
+            # The memory of fixed mass points has no effect, and only some kernels change it.
+            field[:] = np.where(self.plan.fixed, 0, self.kernel.arrays.get_field(index))
+        return memory
 
 
 def _initial_data(plan: Plan, layout: SheetLayout, state: State | None) -> InitialData:
@@ -243,11 +241,8 @@ def _initial_data(plan: Plan, layout: SheetLayout, state: State | None) -> Initi
     by_column[base.REST_X] = axes(sheet)[0]
     by_column[base.HAS_LEFT] = column > 0
     by_column[base.HAS_RIGHT] = column < layout.cols - 1
-    constants = (
-        *spacing(sheet),
-        sheet.size[0] / 2,
-        *(n for term in layout.config.terms for n in term.constants(plan)),
-    )
+    of_terms = (constant for term in layout.config.terms for constant in term.constants(plan))
+    constants = *spacing(sheet), sheet.size[0] / 2, *of_terms
     fields = np.concatenate([term.fields(plan) for term in layout.config.terms])
     if state is not None and len(state.memory):
         fields[layout.config.memory_fields] = state.memory

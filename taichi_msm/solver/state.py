@@ -18,7 +18,7 @@ class LargestDisplacement(NamedTuple):
     row: int  # row of the mass point
     column: int  # column of the mass point
     distance: float  # of the mass point from its rest position [m]
-    reach: float  # Euclidean norm of all displacements [m]
+    reach: float  # Euclidean norm of the displacements of all mass points [m]
 
 
 def largest_displacement(displacement: NDArray[np.floating]) -> LargestDisplacement:
@@ -61,15 +61,15 @@ class RunProgress:
     shortest_spring: float = 1.0  # as in a `Reading`, at any frame so far
     longest_spring: float = 1.0  # as in a `Reading`, at any frame so far
     energy: float = 0.0  # as in a `Reading`, at this frame [J]
-    reach: float = 0.0  # Euclidean norm of all displacements at this frame [m]
+    reach: float = 0.0  # Euclidean norm of the displacements of all mass points at this frame [m]
     deepest: float = 0.0  # largest depth of a mass point below its rest position at any frame so far [m]
     peak: float = 0.0  # largest energy at any frame so far [J]
     residual: float = 0.0  # as in a `Reading`, the largest of all frames so far
     evaluations: int = 0  # as in a `Reading`, the sum over all frames so far
-    least_energy: float = 0.0  # as measured by `DivergenceMonitor` [J]
-    energy_growth: float = 0.0  # as measured by `DivergenceMonitor` [J]
-    pierced_by: int = 0  # number, from 1, of the first probe reported by `piercing`; 0 without a report
-    pierced_frame: int = 0  # frame of the report
+    least_energy: float = 0.0  # smallest energy at a frame after the last load [J]; 0 until then
+    energy_growth: float = 0.0  # largest factor of growth from this smallest energy to a later one
+    pierced_by: int = 0  # index of the first probe that pierced the sheet, plus 1; 0 if none did
+    pierced_frame: int = 0  # the first frame at which it did; 0 if none
     max_displacement_frame: int = 0  # the first frame with the largest displacement
 
 
@@ -81,10 +81,10 @@ class TipForce(NamedTuple):
 
     Attributes:
         probe: index of the probe in the scene.
-        tip: of a position-controlled tool the lowest point of its round tip, otherwise the control point on the
-            deformed sheet [m].
-        force: on the mass points that are not fixed [N]. Of a position-controlled tool in motion it is the mean over
-            the steps since the previous frame, and 0 at the first frame.
+        tip: position [m]: the lowest point of an instrument on a path, the mean position of the mass points of a clamp,
+            or the control point of a force-controlled tool on the deformed sheet.
+        force: force on the mass points that are not fixed [N]; in motion, the force of a position-controlled tool is
+            the mean over the steps since the previous frame, and 0 at the first frame.
     """
 
     probe: int
@@ -111,5 +111,5 @@ class Snapshot(NamedTuple):
 
     state: State  # at a step, which can lie between two frames
     progress: RunProgress  # at the last frame up to this step
-    felt: ProbeForces  # at the last frame up to this step
+    probe_forces: ProbeForces  # at the last frame up to this step
     probes: tuple[Probe, ...] = ()  # with the paths followed so far; empty if equal to the scene's probes

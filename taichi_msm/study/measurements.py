@@ -30,7 +30,7 @@ from taichi_msm.render.rasterizer import Rasterizer
 from taichi_msm.scene.scene import Scene
 from taichi_msm.scene.section import MAX_POINTS
 from taichi_msm.solver.dynamics import Dynamics
-from taichi_msm.solver.planning import plan_variant, stable_steps, try_plan, with_time
+from taichi_msm.solver.planning import min_stable_steps, plan_variant, try_plan, with_time
 from taichi_msm.study.result import DrawingMeasurement, MeshMeasurement, Reference, SteppingMeasurement, Study
 from taichi_msm.system import process
 from taichi_msm.system.runtime import Device
@@ -98,7 +98,7 @@ class SteppingStudy:
 
     def _series(self, difference: str) -> Iterator[int]:
         """Yield the steps per frame: the smallest stable number, then doubled ones, up to the time limit of a run."""
-        steps = min_steps_per_frame(self._plan.tools, self._plan.grid, stable_steps(self._plans[difference]))
+        steps = min_steps_per_frame(self._plan.tools, self._plan.grid, min_stable_steps(self._plans[difference]))
         samples: list[float] = []
         self._run("f64", difference, steps, samples)
         yield steps

@@ -169,7 +169,7 @@ class FoundationTerm(Term):
 def _steepest(material: Material) -> float:
     """Return the largest tangent stiffness for a factor of 1 [N/m]."""
     stiffening = material.virtual_stiffening
-    return material.virtual * (1.0 if stiffening is None else stiffening.steepest)
+    return material.virtual * (1.0 if stiffening is None else stiffening.factor)
 
 
 def foundation_force(material: Material, k: NDArray[Any] | float, displacement: NDArray[Any]) -> NDArray[Any]:

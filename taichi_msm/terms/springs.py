@@ -457,7 +457,7 @@ class SpringTerm(Term):
 def _unmapped_bound(material: Material) -> float:
     """Return `SpringTerm.stiffness_bound` for factors of 1 [N/m]."""
     across, down, shear = material.across, material.down, material.shear
-    steepest = 1.0 if material.stiffening is None else material.stiffening.steepest
+    steepest = 1.0 if material.stiffening is None else material.stiffening.factor
     return steepest * 4 * max(across + down, across + 2 * shear, down + 2 * shear)
 
 

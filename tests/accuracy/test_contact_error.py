@@ -227,7 +227,7 @@ def test_mesh_companion_is_compared_with_the_run(device: Device, monkeypatch: py
     displacement = np.zeros((*plan.scene.sheet.points, 3))
     estimator.compare_frame(displacement, lambda: None, np.zeros((1, 3)))
     assert compared.call_args.args[0] is displacement
-    assert mesh._sheets[0].plan.grid.steps_per_frame == math.ceil(plan.grid.steps_per_frame / 2)
+    assert mesh._solvers[0].plan.grid.steps_per_frame == math.ceil(plan.grid.steps_per_frame / 2)
     coarse = mesh_companion_plan(plan_of(with_points(small_sheet(), (25, 25))))
     assert coarse is not None
     assert coarse.scene.sheet.points == (18, 18), "24 / sqrt(2) is 16.97 cells"

@@ -47,7 +47,7 @@ def pressed(precision: str = "f32", **sections: object) -> Scene:
 
 def start_of(made: Scene) -> Snapshot:
     zero = np.zeros((*made.sheet.points, 3), made.time.precision.replace("f", "float"))
-    return Snapshot(State(0, zero, zero), RunProgress(), ForceRecorder(plan_of(made)).at_rest())
+    return Snapshot(State(0, zero, zero), RunProgress(), ForceRecorder(plan_of(made)).at_start())
 
 
 def with_fault(snapshot: Snapshot, array: str, change: float, seed: int) -> Snapshot:

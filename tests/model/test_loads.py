@@ -161,7 +161,7 @@ def test_redundant_and_later_keyframes_change_no_bit() -> None:
 @pytest.mark.parametrize("at", [[[0, 0, 0], [0.02, 0, 0], [0.02, 1, 1]], [[0.02, 0, 0], [0.02, 1, 1]]])
 def test_jump_of_a_control_point_shares_the_force(at: list[list[float]]) -> None:
     loads = average_loads(plan_with({"at": at, "load": [[0, 100], [0.02, 100], [0.02, 50]]}), 0, 5)
-    assert [(slot.first_segment, slot.slot_count, slot.moves) for slot in loads.slots] == [(0, 2, True), (1, 2, True)]
+    assert [(slot.probe, slot.moves) for slot in loads.slots] == [(0, True), (0, True)]
     np.testing.assert_allclose(loads.strength[..., 2].T, [[8, 8, 4, 0, 0], [0, 0, 2, 4, 4]], atol=1e-12)
     np.testing.assert_allclose(loads.point[2], [[-0.2, 0.15], [0.2, -0.15]])
     np.testing.assert_allclose(loads.point[:2, 0], [[-0.2, 0.15]] * 2)
@@ -186,12 +186,11 @@ def test_slots_of_a_control_point_with_1000_jumps() -> None:
     probes = [{"force": [0, 0, 8], "at": at}, PRESS]
     made = scene(springs=SOFT, probes=probes, time={"duration": 10.0, "step": 0.005})
     averages = average_loads(plan_of(made), 2, 1)
-    slots = [(slot.probe, slot.first_segment, slot.slot_count, slot.moves) for slot in averages.slots]
-    assert slots == [(0, 0, 2, True), (0, 1, 2, True), (1, 0, 1, False)]
+    assert [(slot.probe, slot.moves) for slot in averages.slots] == [(0, True), (0, True), (1, False)]
     np.testing.assert_allclose(sum(averages.strength[0, :2, 2]), 8, rtol=1e-12)
     assert len(probe_slots(made.probes, made.sheet, 0.01)) == 1 + 3, "two jumps within a hat of 0.01 s"
     # Without averaging, a probe has one slot.
-    assert [slot.slot_count for slot in evaluate_loads(plan_of(made), np.array([0.0104])).slots] == [1, 1]
+    assert [slot.probe for slot in evaluate_loads(plan_of(made), np.array([0.0104])).slots] == [0, 1]
 
 
 def test_bounds_of_loads() -> None:

@@ -13,6 +13,7 @@ from taichi_msm.model.surface import Solid, place_instruments
 from taichi_msm.render.camera import view
 from taichi_msm.render.labels import LABELS
 from taichi_msm.scene.scene import Scene
+from taichi_msm.shapes import SHAPES
 from taichi_msm.system.runtime import Device
 from tests.lenses.test_lenses import INTRINSICS, LENSES
 from tests.reference import labels as twin
@@ -85,7 +86,7 @@ def test_normals_of_a_plane_and_a_capsule(camera: str, device: Device) -> None:
         # 2^-24 of a coordinate of the picture, some hundred, over the sides of a small quad, a few pixels long.
         np.testing.assert_allclose(normals, np.tile(tilt[:, 2] @ axes(made), (len(normals), 1)), atol=2e-5)
 
-    capsule = Solid(np.array([-0.03, 0.02, 0.03]), np.array([0.96, 0.0, 0.28]), 0.05, 0.03)
+    capsule = Solid(np.array([-0.03, 0.02, 0.03]), np.array([0.96, 0.0, 0.28]), 0.05, 0.03, SHAPES["capsule"])
     labels = draw_labels(made, rest, LABELS, [capsule])
     tip, axis = (capsule.tip - view(made).eye) @ axes(made), capsule.axis @ axes(made)
     offset = points(made, labels.depth) - tip

@@ -85,7 +85,7 @@ def read(out: Path) -> list[Any]:
         read_manifest(out)[0].as_json(),
         positions,
         forces,
-        saved.felt,
+        saved.probe_forces,
         saved.state.steps,
         saved.state.displacement.tolist(),
         saved.state.difference.tolist(),

@@ -113,7 +113,7 @@ def test_forces_of_a_restored_simulation(device: Device, message: Messages) -> N
         simulation.advance(10)
         assert simulation.felt == end
         with message.raises(ArgumentError, "probes"):
-            simulation.restore(saved._replace(felt=saved.felt._replace(forces=())))
+            simulation.restore(saved._replace(probe_forces=saved.probe_forces._replace(forces=())))
 
 
 def table_of(directory: Path) -> list[list[str]]:
@@ -180,5 +180,5 @@ def test_forces_before_a_divergence(device: Device) -> None:
         assert simulation.felt == felt
         good = simulation.diagnose(start).last_sound_state
         assert good is not None
-        assert good.felt == felt
+        assert good.probe_forces == felt
         assert felt.forces[0].force[2] < -0.1

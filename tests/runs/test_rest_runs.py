@@ -19,7 +19,7 @@ from taichi_msm.runs.finished import read_run
 from taichi_msm.runs.run import resume, run
 from taichi_msm.runs.simulation import Simulation
 from taichi_msm.scene.scene import Scene
-from taichi_msm.solver.rest import FORCE_TOLERANCE, build_dynamics
+from taichi_msm.solver.rest import FORCE_TOLERANCE, build_solver
 from taichi_msm.solver.sheet_solver import choose_layout
 from taichi_msm.study.study import run_study
 from taichi_msm.system.runtime import Device
@@ -195,11 +195,11 @@ def test_companion_run_that_does_not_converge(
     made = at_rest([PUSH])
 
     def failing(*arguments: Any, **keys: Any) -> Any:
-        companion = build_dynamics(*arguments, **keys)
+        companion = build_solver(*arguments, **keys)
         monkeypatch.setattr(companion, "advance", diverges)
         return companion
 
-    monkeypatch.setattr("taichi_msm.accuracy.mesh.build_dynamics", failing)
+    monkeypatch.setattr("taichi_msm.accuracy.mesh.build_solver", failing)
     record = run(made, tmp_path / "out", threads=device.threads)
     assert record["error_estimate"] is not None
     assert record["error_estimate"]["mesh_error"] is None

@@ -191,7 +191,7 @@ def test_run_without_stored_positions(
     requested: bool | None, small: Path, device: Device, monkeypatch: pytest.MonkeyPatch, message: Messages
 ) -> None:
     """It restarts if its error is estimated, which needs all frames; `resume` continues without an estimate."""
-    monkeypatch.setattr(planning, "MAX_COMPANION_SHARE", 0.0)
+    monkeypatch.setattr(planning, "MAX_COMPANION_FRACTION", 0.0)
     made = dragged("time.duration=0.2", "output=[]")
     whole = run(made, "whole", threads=device.threads, estimate_error=requested)
     assert (whole["error_estimate"] is None) == (not requested)

@@ -12,7 +12,7 @@ from PIL import Image
 
 from taichi_msm.scene.scene import Scene
 from taichi_msm.solver.arrays import SheetLayout
-from taichi_msm.solver.rest import build_dynamics
+from taichi_msm.solver.rest import build_solver
 from taichi_msm.solver.sheet_solver import choose_layout
 from taichi_msm.system.runtime import Device
 from tests.scenes import PRESS, plan_of, random_tissue, scene, speckle
@@ -67,7 +67,7 @@ def image(tmp_path: Path) -> str:
 def states(made: Scene, device: Device, layout: SheetLayout, *, piece: int = 10**9, restarts: bool = False) -> bytes:
     """The last state and the tool forces at all frames, for steps in pieces or with a restart within each frame."""
     plan, forces = plan_of(made), []
-    sheet, steps = build_dynamics(plan, device, layout), plan.grid.steps_per_frame
+    sheet, steps = build_solver(plan, device, layout), plan.grid.steps_per_frame
     for _ in range(plan.grid.frames):
         halves = [count for count in (steps // 2 + 1, steps - steps // 2 - 1) if count]
         for count in halves if restarts else [min(piece, steps)] * -(-steps // piece):
