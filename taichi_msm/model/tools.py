@@ -230,7 +230,8 @@ def path_problems(scene: Scene, tools: Sequence[Tool], grid: TimeGrid) -> Iterat
         if problem := friction_problem(tool, at_rest=scene.time.at_rest):
             yield Problem(("probes", tool.probe, "friction"), problem)
         if not scene.time.at_rest and (fault := speed_problem(tool, grid)):
-            yield Problem((*key, fault[0]), fault[1])
+            hint = f"; {scene.sheet.unit_hint}" if scene.sheet.unit_hint else ""
+            yield Problem((*key, fault[0]), fault[1] + hint)
 
 
 def friction_problem(tool: Tool, *, at_rest: bool) -> str:

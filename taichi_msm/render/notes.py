@@ -17,13 +17,8 @@ from taichi_msm.scene.scene import Scene
 
 def drawing_warnings(scene: Scene) -> Iterator[str]:
     """Yield warnings about the rendering of a scene, one line each."""
-    height, width = scene.sheet.size
-    # Tissue is smaller than 5 m: a larger sheet is probably in millimetres.
-    if max(height, width) > 5.0:
-        yield (
-            f"sheet.size: {height:g} x {width:g} m is large for tissue; if these are millimetres, take "
-            f"[{height / 1000:g}, {width / 1000:g}]"
-        )
+    if scene.sheet.unit_hint:
+        yield scene.sheet.unit_hint
     if scene.draws:
         yield from _stretched_picture(scene)
         if texture.is_see_through(scene):

@@ -50,6 +50,15 @@ class Sheet(Section):
         f"a number, {MIN_TOLERANCE:g} to {MAX_TOLERANCE:g}",
     )
 
+    @property
+    def unit_hint(self) -> str:
+        """Warning about a size that is probably in millimetres; empty for a sheet of up to 5 m."""
+        height, width = self.size
+        if max(height, width) <= 5.0:
+            return ""
+        remedy = f"if these are millimetres, take [{height / 1000:g}, {width / 1000:g}]"
+        return f"sheet.size: {height:g} x {width:g} m is large for tissue; {remedy}"
+
 
 class StiffnessMap(Section):
     """Image over the whole sheet, whose grey values are factors of the stiffness."""

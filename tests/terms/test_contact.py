@@ -129,6 +129,12 @@ def test_invalid_tools(message: Messages) -> None:
             check_scene({"sheet": sheet, "tissue": tissue, "time": time, "output": [], "probes": [probe]})
 
 
+def test_fast_tool_on_a_sheet_in_millimetres(message: Messages) -> None:
+    sheet, path = {"points": [9, 11], "size": [60, 80]}, [[0, 0.5, 0.5, 0.01], [0.4, 0.6, 0.5, 0.01]]
+    with message.raises(SceneError, "probes.0.path.1", "[0.06, 0.08]"):
+        check_scene(touching([moved(*path)], sheet=sheet))
+
+
 def test_largest_motion_in_a_step(message: Messages) -> None:
     """Half the radius, 0.025 m: within a segment of the path, across a keyframe, and from the start on."""
 
