@@ -230,7 +230,8 @@ def run_warnings(
             source = "the time step" if time_step.in_f64 > REMEDY_THRESHOLD / 2 else "rounding"
             yield f"for a smaller error of {source}, {_step_remedy(plan, time_step, affords)}"
     elif reason == QUASISTATIC_REASON:
-        yield "error: no time step in a quasi-static scene"
+        if mesh is None:
+            yield "error not estimated: a quasi-static scene has no time step"
     elif reason:
         yield f"error {'of the time step ' if mesh is not None else ''}not estimated: {reason}"
     if force is not None:
@@ -297,7 +298,7 @@ def _error_line(
         distance = max(errors) * max_displacement
         pixels = f", {_digits(distance * scale)} px" if scale is not None else ""
         size = f"{_digits(1000 * max_displacement, 2)} mm ({_digits(1000 * distance)} mm{pixels})"
-        sentences.append(f"error: {', '.join(parts)} of {size}")
+        sentences.append(f"estimated error: {', '.join(parts)} of {size}")
     if mesh is not None and mesh.error == math.inf:
         sentences.append(f"mesh error not known: {mesh.doubt}")
     return "; ".join(sentences)

@@ -65,7 +65,7 @@ def test_estimate_of_a_run_against_the_true_error(overrides: Sequence[str], smal
     error = true_error(plan_of(made), device, fine=16)
     # The extremes of 98 scenes outside this test were 0.89 and 1.5.
     assert 0.8 * error < estimate < 1.5 * error
-    assert record["notes"][0].startswith("error: time step ")
+    assert record["notes"][0].startswith("estimated error: time step ")
     assert record["timings"]["pilot"] > 0
 
 
@@ -128,6 +128,7 @@ def test_warnings_of_missing_and_doubtful_estimates(device: Device, message: Mes
     message(warnings(RunErrorEstimates(rounded, "", MeshEstimate(0.004, WRINKLING), ForceEstimate(0.03))))
     message(warnings(RunErrorEstimates(reason=QUASISTATIC_REASON, mesh=MeshEstimate(0.004, OVERLAP))))
     message(warnings(RunErrorEstimates(mesh=MeshEstimate(0.02, WRINKLING))))
+    message(warnings(RunErrorEstimates(reason=QUASISTATIC_REASON)))
     for doubt in (NARROW_TIP, NOT_CONVERGED, LARGE_STEP_ERROR):
         message(warnings(RunErrorEstimates(mesh=MeshEstimate(math.inf, doubt))), "mesh error not known")
     for known in (RunErrorEstimates(), RunErrorEstimates(mesh=MeshEstimate(0.004))):
@@ -223,7 +224,7 @@ def test_fine_companion_follows_a_large_error(
     _, record, estimate = run_with_error(overrides, device)
     assert record["error_estimate"]["at_least"]
     assert estimate == pytest.approx(error, rel=0.5)
-    assert record["notes"][0].startswith("error: time step at least ")
+    assert record["notes"][0].startswith("estimated error: time step at least ")
 
 
 def test_interrupted_fine_companion_leaves_a_complete_run(small: Path, device: Device) -> None:
@@ -256,7 +257,7 @@ def test_bounds_by_a_coarse_companion_in_f32(
     assert estimate == pytest.approx(3 * true_error(plan_of(made), device, fine=16), rel=0.5)
     parts = record["error_estimate"]
     assert (parts["rounding"], parts["in_f64"], parts["at_least"]) == (None, None, False)
-    assert record["notes"][0].startswith("error: time step and rounding at most about ")
+    assert record["notes"][0].startswith("estimated error: time step and rounding at most about ")
 
 
 @pytest.mark.parametrize("difference", ["central", "backward"])
