@@ -191,9 +191,9 @@ def pair() -> str:
         PAIR_PICTURE, quality=88
     )
     return (
-        "In the picture, corresponding points of the rectified pictures are in the same row to\n"
-        f"{offsets[0]:.4f} px. Without `criteria`, after OpenCV's five iterations, they are up to {offsets[1]:.2f} px\n"
-        "apart, and more where lenses distort more. (`docs/make_labels.py` makes the picture and these lines.)\n"
+        "Corresponding points of the rectified pictures are in the same row to\n"
+        f"{offsets[0]:.4f} px; without `criteria`, after OpenCV's five iterations, up to {offsets[1]:.2f} px\n"
+        "apart, and more with lenses that distort more.\n"
     )
 
 
@@ -223,14 +223,13 @@ def main() -> None:
     }
     page(panels).save(PICTURE, quality=92)
     warping = (
-        f"The top picture shows it: frame {FRAME} of `{SCENE}.yaml` and the next, drawn without light at\n"
+        f"In the top picture, frame {FRAME} of `{SCENE}.yaml` and the next, without light, with\n"
         f"{SIZE} × {SIZE} pixels of {SAMPLES} × {SAMPLES} samples, differ by {before:.2f} grey levels on average\n"
-        f"where the next one shows the same; fetched from where flow leads, by {after:.2f}, due to filtering.\n"
-        f"Lit frames differ by {lit_left:.2f} then. Light is not carried along by the tissue: how bright a point is\n"
-        "depends on how it is turned to the lamp and how near it is, the tool's shadow moves over it, and highlights\n"
-        f"change with the line of sight. {matt:.2f} are left without highlights (`light.gloss: 0`), and {shadow:.2f}\n"
-        "if light comes from everywhere, too (`light.ambient: 1`): the shadow, and filtering. To compare frames by\n"
-        "their colours, draw them with `shading: none`. (`docs/make_labels.py` makes the picture and these lines.)\n"
+        f"where both show a point, and after warping by {after:.2f}, due to filtering. Lit frames then differ by\n"
+        f"{lit_left:.2f}, as light does not move with the tissue: by {matt:.2f} without highlights\n"
+        f"(`light.gloss: 0`), and by {shadow:.2f} if light also comes from everywhere (`light.ambient: 1`), due to\n"
+        "the tool's shadow and filtering. To compare frames by their colours, draw them with `shading: none`. (By\n"
+        "`docs/make_labels.py`, as the lines on the stereo pair.)\n"
     )
     for name, lines in (("warping", warping), ("pair", pair())):
         text = PAGE.read_text(encoding="utf-8")
