@@ -291,7 +291,7 @@ def test_fit_page(points: str, examples_folder: Path, program: Program, capfd: p
         return re.sub(r"31, ?31", points, text)
 
     estimate, unidentifiable = (block.splitlines() for block in blocks(DOCS / "fit.md", "text"))
-    typed = ([smaller(word) for word in words] for words in commands(DOCS / "fit.md") if "beef.yaml" not in words)
+    typed = ([smaller(word) for word in words] for words in commands(DOCS / "fit.md") if "TABLE.xlsx" not in words)
     observe, fit, press, _, fit_with_forces = typed
     assert program(*observe, "--no-estimate").returncode == 0
     done = program(*fit)
