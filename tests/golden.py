@@ -92,9 +92,9 @@ class Messages:
         assert text == known[self._count - 1]
 
     def require_all(self) -> None:
-        """Require that the test has provoked all its messages in the golden file."""
+        """Require that the test, unless it was skipped, has provoked all its messages in the golden file."""
         known = read().get(self._tests, {}).get(self._test, [])
-        assert self._written is not None or self._count == len(known), f"{self._count} of {len(known)} messages"
+        assert self._count in (0, len(known)), f"{self._count} of {len(known)} messages"
 
     @contextmanager
     def raises(

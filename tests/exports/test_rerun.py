@@ -14,7 +14,6 @@ import pytest
 from PIL import Image
 
 from taichi_msm import NotInstalledError, export
-from taichi_msm.exports import rerun
 from taichi_msm.model.surface import place_instruments
 from taichi_msm.render.camera import view_at
 from taichi_msm.render.lens import IDENTITY_LENS
@@ -93,7 +92,8 @@ def test_warning_of_distortion(
     labelled_in_motion: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, message: Messages
 ) -> None:
     pytest.importorskip("rerun.chunk")
-    monkeypatch.setattr(rerun, "view_at", lambda *arguments: view_at(*arguments)._replace(lens=IDENTITY_LENS))
+    distorted = lambda *arguments: view_at(*arguments)._replace(lens=IDENTITY_LENS)  # noqa: E731
+    monkeypatch.setattr("taichi_msm.exports.rerun.view_at", distorted)
     message(export(labelled_in_motion, "rerun", tmp_path / "out").notes, "distortion")
 
 
