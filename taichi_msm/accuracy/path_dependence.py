@@ -93,7 +93,7 @@ class PathDependence:
 
     def affords(self, companion_cost: float) -> bool:
         """Return whether second solutions and companion runs of a given cost together cost a small part of the run."""
-        # Each of the three second solutions begins at rest, and therefore costs about as much as three frames.
+        # Three second solutions, each at the cost of about three frames, as it begins at rest.
         second_cost = 3 * 3 / (self._plan.grid.frames + 1)
         return affords_companions(self._plan, companion_cost + second_cost)
 

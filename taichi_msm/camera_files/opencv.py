@@ -103,7 +103,7 @@ def read_camera(keys: Keys) -> Calibration:
 
 
 def read_pose(keys: Keys) -> StereoPose | None:
-    """Read R and T; None if the file has neither. R1 and R2, which have the mark of a camera, are other rotations."""
+    """Read R and T; None if the file has neither. R1 and R2 are ignored, as they belong to a rectification."""
     unmarked = {name: value for name, value in keys.data.items() if keys.folded[name] == fold(name)}
     shared = Keys(keys.file, unmarked, lines=keys.lines)
     if not shared.values(ROTATION) and not shared.values(TRANSLATION):

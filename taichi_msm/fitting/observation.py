@@ -99,7 +99,7 @@ class Observation(ABC):
 
     @abstractmethod
     def signal(self, scene: Scene) -> float:
-        """Return the root mean square of the motion or of the forces, the size of what a model explains [unit]."""
+        """Return the root mean square of the observed motion or forces [unit]."""
 
     @abstractmethod
     def fits_well(self, residuals: Array, deviation: float, signal: float) -> bool:

@@ -13,7 +13,7 @@ with its expectation, R^2 minus the effective number of parameters, tr(J^T J (J^
 search and choice of w alternate until w is stable.
 
 Standard errors are those of Laplace's approximation, from the inverse of J^T J + w L; they hold for smooth tissue only.
-A map cell is unknown if its error would exceed `MAX_KNOWN_ERROR` even with all other cells given.
+A map cell is unknown if its error exceeds `MAX_KNOWN_ERROR` even for known other cells.
 """
 
 from __future__ import annotations

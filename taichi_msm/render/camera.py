@@ -55,7 +55,7 @@ class View(NamedTuple):
     pinhole: bool  # whether the projection is perspective
     lens: Lens | None = None
     baseline: float = 0.0  # distance to the companion along the x axis [m]; 0 unless the cameras are parallel
-    companion: View | None = None  # second camera of the stereo pair, whose key `beside` names this camera
+    companion: View | None = None  # right camera of a stereo pair, of which this is the left one
     light_view: View | None = None  # camera that carries the light; None if it is this camera
 
     @property

@@ -171,7 +171,7 @@ class Render(Section):
     def companion(self, name: str) -> str:
         """Return the name of the first camera whose `beside` is `name`, or "" without one."""
         cameras = self.all_cameras.items()
-        return next((other for other, camera in cameras if isinstance(camera, Camera) and camera.beside == name), "")
+        return next((right for right, camera in cameras if isinstance(camera, Camera) and camera.beside == name), "")
 
 
 def _read_files(camera: AnyCamera, info: ValidationInfo) -> AnyCamera:

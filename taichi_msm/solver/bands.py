@@ -235,7 +235,7 @@ def build_advance(config: KernelConfig, *, parallel: bool) -> Callable[..., None
     def step_band(
         sheet: ti.template(), carried: ti.template(), loads: ti.template(), band: ti.template(), sizes: ti.template()
     ):
-        """Take the steps of a launch on a band, from the worker's recorded progress on, and record the new progress."""
+        """Advance a band by the steps of a launch, from its worker's recorded progress on; record the new progress."""
         first, own = sizes[FIRST], WORKER_STRIDE * band.worker
         count, depth = ti.cast(sizes[COUNT], ti.i32), ti.cast(sizes[DEPTH], ti.i32)
         carried_rows = ti.cast(sizes[CARRIED_ROWS], ti.i32)

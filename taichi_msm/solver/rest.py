@@ -200,7 +200,7 @@ class QuasiStatics(SheetSolver[Relaxation]):
         return any(clamp.tip_centre(np.array([time])).any() for clamp in clamps)
 
     def _try_flat(self, row: NDArray[Any]) -> bool:
-        """Take the flat shape if it is an equilibrium; return whether it is."""
+        """Set the flat shape if it is an equilibrium, and return whether it is."""
         relaxation, shape = self.kernel, self._read_arrays(differences=False)[0]
         relaxation.place(np.zeros_like(shape))
         count, force = relaxation.relax(1, 0.0, row)
