@@ -80,7 +80,7 @@ class DivergenceMonitor:
         self.progress = progress or RunProgress()
         self._grid, material = plan.grid, plan.material
         self._acceleration = self._tool_energy = 0.0
-        self._load_norms = np.array([decay_norm_bound(slot, plan.scene) for slot in plan.slots])
+        self._load_norms = np.array([decay_norm_bound(slot, plan) for slot in plan.slots])
         self._oscillation = ENERGY_OSCILLATION / max(1e-9, 1 - (plan.grid.step / plan.stable_step) ** 2)
         self._relaxing_share = sum(share for share, _ in material.relaxation)
         self._oscillation /= 1 - self._relaxing_share

@@ -25,10 +25,11 @@ from taichi_msm.solver.arrays import build_point_step
 from taichi_msm.solver.bands import MOMENT_ROWS, build_fill_halo
 from taichi_msm.solver.row import build_pass_row
 from taichi_msm.system.runtime import ITERATIONS_PER_THREAD, ti
-from taichi_msm.terms.base import AREA_SHARE, DX, DY, GAIN, MOBILITY, Entry, KernelConfig, KernelRow, KernelSheet
+from taichi_msm.terms.base import DX, DY, GAIN, Entry, KernelConfig, KernelRow, KernelSheet
 from taichi_msm.terms.bending import BendingTerm, build_laplacian
 from taichi_msm.terms.foundation import FoundationTerm
 from taichi_msm.terms.loads import ProbeTerm
+from taichi_msm.terms.points import build_point_functions
 from taichi_msm.terms.springs import ALONG_COLUMN, ALONG_ROW, DIAGONAL, SpringTerm
 
 # Indices into the sizes of a launch:
@@ -81,9 +82,8 @@ class AdjointSheet(NamedTuple):
     """Arrays of a `KernelSheet`, extended for the adjoint."""
 
     u: Any  # p, q and the derivative of the loss; with bending also the moments of p
-    # by_column, stiffness, fields, constants, rows, width: as in `KernelSheet`
+    # by_column, fields, constants, rows, width: as in `KernelSheet`
     by_column: Any
-    stiffness: Any
     fields: Any
     constants: Any
     rows: Any
@@ -228,7 +228,7 @@ def build_store(code: KernelConfig, *, parallel: bool) -> Callable[..., None]:
         loads: ti.types.ndarray(dtype=real, ndim=2),
         u_x: vectors, u_y: vectors, u_z: vectors,
         d_x: vectors, d_y: vectors, d_z: vectors,
-        constants_of: ti.types.ndarray(dtype=vector, ndim=1), by_column: vectors, stiffness: vectors, fields: vectors,
+        constants_of: ti.types.ndarray(dtype=vector, ndim=1), by_column: vectors, fields: vectors,
     ):  # fmt: skip
         """Step forward.
 
@@ -238,7 +238,7 @@ def build_store(code: KernelConfig, *, parallel: bool) -> Callable[..., None]:
             loads: loads of every step, as in `Dynamics.step_table`, shape (steps, columns).
             u_x, u_y, u_z: displacements of all steps [m], then the workers' moments and carried forces.
             d_x, d_y, d_z: last differences of the displacements [m], updated.
-            constants_of, by_column, stiffness, fields: arrays of the sheet, see `KernelSheet`.
+            constants_of, by_column, fields: arrays of the sheet, see `KernelSheet`.
         """
         ti.loop_config(serialize=not parallel)
         for index in range(ti.cast(sizes[WORKERS], ti.i32) * ITERATIONS_PER_THREAD):
@@ -246,7 +246,7 @@ def build_store(code: KernelConfig, *, parallel: bool) -> Callable[..., None]:
                 rows, width = ti.cast(sizes[ROWS], ti.i32), ti.cast(sizes[STRIP], ti.i32) + 2
                 constants = [constants_of[n][0] for n in ti.static(range(count_of_numbers))]
                 u, d = ti.static((u_x, u_y, u_z), (d_x, d_y, d_z))
-                sheet = ti.static(KernelSheet(u, d, by_column, stiffness, fields, constants, rows, width))
+                sheet = ti.static(KernelSheet(u, d, by_column, fields, constants, rows, width))
                 run_worker(sheet, loads, sizes, progress, index // ITERATIONS_PER_THREAD)
 
     return store
@@ -257,7 +257,8 @@ def _build_sweep_row(code: KernelConfig) -> Callable[..., None]:
     vector, columns, springs = code.vector, code.first_column(None), code.require(SpringTerm)
     structural, shear, tension = springs.structural, springs.shear, springs.tense
     differentiate = springs.build_spring_tangent(code)
-    row_stiffness, column_stiffness, diagonal_stiffness = springs.build_stiffness(code)
+    mobility, area_share, _ = build_point_functions(code)
+    stiffness = springs.build_stiffness(code)
     tangents = [add for term in code.terms for add in term.build_tangents(code)]
     dampings = [damp for term in code.terms for damp in term.build_damping(code)]
     probes, foundation_term = code.require(ProbeTerm), code.get(FoundationTerm)
@@ -302,24 +303,25 @@ def _build_sweep_row(code: KernelConfig) -> Callable[..., None]:
             falling = [vector(0) for _ in ti.static(range(results))]
             rising = [vector(0) for _ in ti.static(range(results))]
             if ti.static(structural):
-                k = row_stiffness(sheet, i, kind, b)
+                k = stiffness(sheet, ALONG_ROW, True, i, kind, b)
                 spring = spring_tangent(
                     sheet, offset, entry_row + b, entry_row + b + 1, 0 - dx, 0 * dy, dx, k, ALONG_ROW
                 )
                 for c in ti.static(range(results)):
                     right[c] = spring[c]
             if ti.static(shear):
-                k = diagonal_stiffness(sheet, i + 1, b)
+                k = stiffness(sheet, DIAGONAL, True, i, kind, b)
                 down_right = spring_tangent(
                     sheet, offset, entry_row + b, below + b + 1, 0 - dx, dy, diagonal, k, DIAGONAL
                 )
+                k = stiffness(sheet, DIAGONAL, False, i, kind, b)
                 down_left = spring_tangent(sheet, offset, entry_row + b + 1, below + b, dx, dy, diagonal, k, DIAGONAL)
                 for c in ti.static(range(results)):
                     falling[c], rising[c] = down_right[c], down_left[c]
             if b > 0:
                 down = [vector(0) for _ in ti.static(range(results))]
                 if ti.static(structural):
-                    k = column_stiffness(sheet, i + 1, b)
+                    k = stiffness(sheet, ALONG_COLUMN, True, i, kind, b)
                     spring = spring_tangent(sheet, offset, entry_row + b, below + b, 0 * dx, dy, dy, k, ALONG_COLUMN)
                     for c in ti.static(range(results)):
                         down[c] = spring[c]
@@ -334,7 +336,7 @@ def _build_sweep_row(code: KernelConfig) -> Callable[..., None]:
                     entry = ti.static(Entry(line, b, p, u))
                     for add_change in ti.static(tangents):
                         add_change(force, sheet, entry, now)
-                    gain = now[GAIN] * sheet.by_column[(MOBILITY + kind) * width + b]
+                    gain = now[GAIN] * mobility(sheet, i, kind, b)
                     q = [sheet.u[c][(ADJOINT_CHANGE * sheet.rows + i) * width + b] for c in ti.static(range(3))]
                     # By summation by parts over all n, p_{n+1} (u_n - u_{n-1}) equals q_{n+1} u_n but for rounding.
                     keep_sum = q[0] * u[0] + q[1] * u[1] + q[2] * u[2]
@@ -373,7 +375,7 @@ def _build_sweep_row(code: KernelConfig) -> Callable[..., None]:
                         of_diagonals = falling[BY_TENSION] + rising[BY_TENSION]
                         sums[TENSION_SUMS + DIAGONAL] = sums[TENSION_SUMS + DIAGONAL] - of_diagonals
                     if ti.static(code.by_area):
-                        keep_sum *= sheet.by_column[(AREA_SHARE + kind) * width + b]
+                        keep_sum *= area_share(sheet, i, kind, b)
                     sums[KEEP_SUM] += keep_sum
                     add_load_derivatives(load_sums, sheet, entry, now)
                     for laplacian in ti.static(laplacians):
@@ -447,7 +449,7 @@ def build_sweep(code: KernelConfig, *, parallel: bool) -> Callable[..., None]:
         p_x: vectors, p_y: vectors, p_z: vectors,
         u_x: vectors, u_y: vectors, u_z: vectors,
         constants_of: ti.types.ndarray(dtype=vector, ndim=1),
-        by_column: vectors, stiffness: vectors, fields: vectors, derivatives: vectors,
+        by_column: vectors, fields: vectors, derivatives: vectors,
     ):  # fmt: skip
         """Sweep backward.
 
@@ -457,7 +459,7 @@ def build_sweep(code: KernelConfig, *, parallel: bool) -> Callable[..., None]:
                 overwritten.
             p_x, p_y, p_z: adjoint state, see `BUFFERS`, then the workers' moments and carried forces; updated.
             u_x, u_y, u_z: displacements of all steps of the segment [m].
-            constants_of, by_column, stiffness, fields: arrays of the sheet, see `KernelSheet`.
+            constants_of, by_column, fields: arrays of the sheet, see `KernelSheet`.
             derivatives: accumulated derivatives, see `SPRING_PARTS`; updated.
         """
         ti.loop_config(serialize=not parallel)
@@ -466,7 +468,7 @@ def build_sweep(code: KernelConfig, *, parallel: bool) -> Callable[..., None]:
                 rows, width = ti.cast(sizes[ROWS], ti.i32), ti.cast(sizes[STRIP], ti.i32) + 2
                 constants = [constants_of[n][0] for n in ti.static(range(count_of_numbers))]
                 p, u = ti.static((p_x, p_y, p_z), (u_x, u_y, u_z))
-                sheet = ti.static(AdjointSheet(p, by_column, stiffness, fields, constants, rows, width, u, derivatives))
+                sheet = ti.static(AdjointSheet(p, by_column, fields, constants, rows, width, u, derivatives))
                 tables = ti.static(LoadTables(loads, by_load))
                 run_worker(sheet, tables, sizes, progress, index // ITERATIONS_PER_THREAD)
 

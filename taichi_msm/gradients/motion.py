@@ -21,7 +21,6 @@ from taichi_msm.gradients import kernel_motion as kernels
 from taichi_msm.gradients.chain_rule import LoadGradient, SheetGradient
 from taichi_msm.model.loads import average_loads
 from taichi_msm.model.plan import Plan
-from taichi_msm.model.sheet import area_shares
 from taichi_msm.model.verlet import coefficients
 from taichi_msm.solver.arrays import SheetLayout, from_lanes, to_lanes
 from taichi_msm.solver.backoff import Backoff
@@ -166,8 +165,7 @@ class MotionAdjoint:
         """
         grid, layout = self.plan.grid, self.layout
         _, gain, _ = coefficients(self.plan)
-        shares = area_shares(self.plan.scene.sheet) if layout.config.by_area else np.ones((layout.rows, layout.cols))
-        start = gain * (~self.plan.fixed / shares)[..., None] * by_frame[-1]
+        start = gain * self.plan.mobility[..., None] * by_frame[-1]
         for c in range(3):
             # p, an empty buffer, and q.
             parts = start[..., c], 0 * start[..., c], start[..., c]
@@ -305,7 +303,7 @@ class MotionAdjoint:
     @property
     def _sheet_arrays(self) -> tuple[Any, ...]:
         arrays = self._forward.kernel.arrays
-        return arrays.constants, arrays.by_column, arrays.stiffness, arrays.fields
+        return arrays.constants, arrays.by_column, arrays.fields
 
     def _max_launch_steps(self) -> int:
         # 10 million steps of a mass point take about 0.1 s on one core.

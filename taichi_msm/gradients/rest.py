@@ -126,9 +126,9 @@ class RestAdjoint:
         scene, by_slot = self.plan.scene, np.zeros((1, len(at_frame.slots), 5))
         for n, slot in enumerate(at_frame.slots):
             probe, at = scene.probes[slot.probe], at_frame.point[0, n]
-            by_slot[0, n, :3] = np.einsum("ij,ijc->c", decay(probe, scene.sheet, at), p)
+            by_slot[0, n, :3] = np.einsum("ij,ijc->c", decay(probe, self.plan, at), p)
             by_decay = p @ at_frame.strength[0, n]
-            by_slot[0, n, 3:] = np.einsum("aij,ij->a", decay_gradient(probe, scene.sheet, at), by_decay)
+            by_slot[0, n, 3:] = np.einsum("aij,ij->a", decay_gradient(probe, self.plan, at), by_decay)
         time = frame / self.plan.grid.frames_per_second
         margin = 1e-3 / self.plan.grid.frames_per_second
         loads.add(lambda plan: evaluate_frame_loads(plan, frame), by_slot, (time - margin, time + margin))

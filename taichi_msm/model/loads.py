@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from taichi_msm.model.plan import HAT_TOLERANCE, Plan, ProbeSegment, ProbeSlot, probe_slots
-from taichi_msm.model.sheet import area_shares, axes
+from taichi_msm.model.sheet import axes
 from taichi_msm.model.tool_force import control_points, point_at, probe_force
 from taichi_msm.scene.scene import Scene
 from taichi_msm.scene.section import FRAME_TOLERANCE
@@ -38,38 +38,40 @@ class Schedule(NamedTuple):
     active: Array  # factor of the virtual springs' stiffness, 0 to 1, shape (steps,)
 
 
-def decay(probe: Probe, sheet: Sheet, at: Array | None = None) -> Array:
+def decay(probe: Probe, plan: Plan, at: Array | None = None) -> Array:
     """Return the decay factor of a probe's force at each mass point, shape (rows, cols).
 
     The factor of a probe with `total` includes the mass point's share of a cell's area.
 
     Args:
         probe: force-controlled probe.
-        sheet: supplies the rest positions of the mass points.
+        plan: supplies the rest positions and the areas of the mass points.
         at: control point, x and y at rest [m], shape (2,); by default the first keyframe of `probe.at`.
     """
+    sheet = plan.scene.sheet
     law, (at_x, at_y) = probe_force(probe, sheet), control_points(probe, sheet)[1][0] if at is None else at
     x, y = axes(sheet)
     factors = law.decay(np.hypot(x - at_x, y - at_y))
-    return factors * area_shares(sheet) if law.by_area else factors
+    return factors * plan.area_shares if law.by_area else factors
 
 
-def decay_gradient(probe: Probe, sheet: Sheet, at: Array | None = None) -> Array:
+def decay_gradient(probe: Probe, plan: Plan, at: Array | None = None) -> Array:
     """Return the derivatives of `decay` by x and y of the control point [1/m], shape (2, rows, cols).
 
     A mass point at the control point has the derivative 0; the decay has none there.
 
     Args:
         probe: force-controlled probe.
-        sheet: supplies the rest positions of the mass points.
+        plan: supplies the rest positions and the areas of the mass points.
         at: control point, x and y at rest [m], shape (2,); by default the first keyframe of `probe.at`.
     """
+    sheet = plan.scene.sheet
     law, (at_x, at_y) = probe_force(probe, sheet), control_points(probe, sheet)[1][0] if at is None else at
     x, y = axes(sheet)
     off = np.stack(np.broadcast_arrays(x - at_x, y - at_y))
     distance = np.hypot(*off)
     outside = (law.falloff * distance + law.shift > law.offset) & (distance > 0)
-    return decay(probe, sheet, at) * law.falloff * outside * off / np.where(outside, distance, 1)
+    return decay(probe, plan, at) * law.falloff * outside * off / np.where(outside, distance, 1)
 
 
 def average_loads(plan: Plan, first: int, count: int) -> Schedule:

@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from taichi_msm.model.sheet import Maps, Material, has_fixed_border
+from taichi_msm.model.sheet import Maps, Material, has_fixed_border, point_areas
 from taichi_msm.model.time_grid import TimeGrid
 from taichi_msm.model.tool_force import control_points
 from taichi_msm.model.tools import Clamp, Tool, build_tools, touching_tools
@@ -104,6 +104,21 @@ class Plan:
     def open_edges(self) -> bool:
         """Whether any mass point at an edge can move."""
         return not has_fixed_border(self.fixed)
+
+    @property
+    def area_shares(self) -> Array:
+        """Area of each mass point as a share of a cell's, shape (rows, cols)."""
+        return point_areas(self.material, self.scene.sheet)
+
+    @property
+    def mobility(self) -> Array:
+        """Inverse mass of each mass point in units of a cell's, 0 if it is fixed, shape (rows, cols)."""
+        return ~self.fixed / (self.area_shares if self.areas_vary and self.material.by_area else 1.0)
+
+    @property
+    def areas_vary(self) -> bool:
+        """Whether mass points that can move have different areas."""
+        return self.open_edges or self.material.shares is not None
 
     @property
     def is_held(self) -> bool:

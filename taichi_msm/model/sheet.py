@@ -101,6 +101,18 @@ class LockNumbers(NamedTuple):
     factor: float  # largest tangent stiffness, relative to the initial one
 
 
+class Springs(NamedTuple):
+    """The springs of a sheet as arrays, in four families.
+
+    Springs along rows have the shape (rows, cols - 1), those along columns (rows - 1, cols), and the diagonals of the
+    cells, first those that fall to the right, then those that rise, (rows - 1, cols - 1) each.
+    """
+
+    stiffness: tuple[Array, Array, Array, Array]  # k of every spring [N/m]; 0 where there is none
+    tension: tuple[Array, Array, Array, Array]  # tau, tension at rest per length [N/m]; in equilibrium
+    rest: Array | None  # rest positions, shape (rows, cols, 3) [m]; None for a flat rectangle
+
+
 @dataclass(frozen=True, eq=False)
 class Material:
     """The coefficients of a sheet; a map multiplies them by its factors."""
@@ -121,6 +133,9 @@ class Material:
     by_area: bool  # whether mass points and springs at an edge are lighter and softer, as with `tissue`
     factors: Array | None  # factor of the stiffness of every cell, shape (rows - 1, cols - 1); None without a map
     virtual_factors: Array | None  # factor of K at every mass point, shape (rows, cols); None without a map
+    springs: Springs | None = None  # None where across, down, shear, tension and factors describe them
+    # Area of every mass point as a share of a cell's, shape (rows, cols); None: 1, at edges 1/2 and at corners 1/4.
+    shares: Array | None = None
 
     @property
     def tensions(self) -> tuple[float, float, float]:
@@ -199,6 +214,11 @@ def area_shares(sheet: Sheet) -> Array:
     rows, cols = np.ones(sheet.points[0]), np.ones(sheet.points[1])
     rows[[0, -1]], cols[[0, -1]] = 0.5, 0.5
     return np.outer(rows, cols)
+
+
+def point_areas(material: Material, sheet: Sheet) -> Array:
+    """Return the area of each mass point as a share of a cell's, shape (rows, cols)."""
+    return area_shares(sheet) if material.shares is None else material.shares
 
 
 def cell_aspect_ratio(sheet: Sheet) -> float:

@@ -10,8 +10,8 @@ take fewer instructions per index:
                  MOBILITY: the inverse share of a cell's mass at a mass point, 0 if it is fixed; AREA_SHARE: its share
                  of a cell's area; three rows each, for the first, a middle and the last row of the sheet
                  REST_X: x at rest [m]; HAS_LEFT, HAS_RIGHT: 1 with a neighbour on this side, else 0
-    fields       numbers of the terms per mass point, all rows of one field after those of another
-    stiffness    with a map, k - tau of every spring, see `SpringTerm.stiffness_array`
+    fields       numbers per mass point, all rows of one field after those of another: mobility and area share unless
+                 `by_column` has them, the rest position of a curved sheet, and the fields of the terms
     constants    of the sheet and its terms, each in the first lane of an entry
 
 With bending, u also contains rows of moments. The load table has one row per step: its gain and the columns of the
@@ -35,7 +35,8 @@ from numpy.typing import NDArray
 from taichi_msm.model.time_grid import DTYPES
 from taichi_msm.solver.state import State
 from taichi_msm.system.runtime import Memory, compilation_options, ti, write_vectors
-from taichi_msm.terms.base import AREA_SHARE, GAIN, MOBILITY, SQUARED_MOTION, KernelConfig, KernelSheet
+from taichi_msm.terms.base import GAIN, SQUARED_MOTION, KernelConfig, KernelSheet
+from taichi_msm.terms.points import build_point_functions
 
 
 @dataclass(frozen=True)
@@ -65,8 +66,7 @@ class InitialData(NamedTuple):
 
     constants: NDArray[Any]  # of the sheet and its terms, shape (constants,)
     by_column: NDArray[Any]  # shape (COLUMN_ROWS, cols)
-    fields: NDArray[Any]  # of the terms, shape (fields, rows, cols)
-    stiffness: NDArray[Any] | None  # of all springs, shape (3 rows + 2, cols); None without a map
+    fields: NDArray[Any]  # shape (fields, rows, cols)
     state: State | None  # state to continue from; None for the sheet at rest
 
 
@@ -118,12 +118,9 @@ class SheetArrays:
         self.constants = self._memory.array(layout.config.precision, lanes, len(start.constants))
         self.by_column = self.allocate_rows(len(start.by_column))
         self.fields = self.allocate_rows(max(1, len(start.fields)) * layout.rows)
-        self.stiffness = self.allocate_rows(1 if start.stiffness is None else len(start.stiffness))
         with np.errstate(over="ignore"):
             write_vectors(self.constants, np.repeat(start.constants[:, None], lanes, axis=1))
         self._set(self.by_column, start.by_column)
-        if start.stiffness is not None:
-            self._set(self.stiffness, start.stiffness)
         if start.state is None:
             for array in (*self.u, *self.d):
                 self._set(array, np.zeros((0, layout.cols)))
@@ -136,7 +133,7 @@ class SheetArrays:
     @property
     def all(self) -> tuple[Any, ...]:
         """All arrays, in the order of the kernels' arguments."""
-        return *self.u, *self.d, self.constants, self.by_column, self.stiffness, self.fields
+        return *self.u, *self.d, self.constants, self.by_column, self.fields
 
     def set_displacement(self, displacement: NDArray[Any]) -> None:
         """Set the displacements [m], shape (rows, cols, 3), and all other content of u to 0."""
@@ -220,7 +217,7 @@ def build_point_step(config: KernelConfig) -> Callable[..., None]:
 
     d_{n+1} = keep d_n + gain F_n,    u_{n+1} = u_n + d_{n+1}                                  (eq. 6 to 9)
     """
-    forces = build_point_forces(config)
+    forces, mobility = build_point_forces(config), build_point_functions(config).mobility
     damping = [reduce for term in config.terms for reduce in term.build_damping(config)]
 
     @ti.func
@@ -228,7 +225,7 @@ def build_point_step(config: KernelConfig) -> Callable[..., None]:
         """Step an entry with the force of its springs and a row of the load table, `now`, into row `target` of u."""
         for add in ti.static(forces):
             add(force, sheet, entry, now)
-        gain = now[GAIN] * sheet.by_column[(MOBILITY + entry.row.kind) * sheet.width + entry.b]
+        gain = now[GAIN] * mobility(sheet, entry.row.i, entry.row.kind, entry.b)
         at = entry.row.i * sheet.width + entry.b
         d = [sheet.d[c][at] for c in ti.static(range(3))]
         for reduce in ti.static(damping):
@@ -256,7 +253,7 @@ def build_read(config: KernelConfig, *, parallel: bool, iterations: int) -> Call
         The kernel `read`, see `SheetKernel.read`.
     """
     real, vector, vectors, lanes = config.real, config.vector, config.vectors, config.lanes
-    count = config.first_constant(None)
+    count, area_share = config.first_constant(None), build_point_functions(config).area_share
     measuring = [measure for term in config.terms for measure in term.build_measures(config)]
     reductions = ["sum", *(reduction for term in config.terms for reduction in term.reductions)]
 
@@ -266,7 +263,7 @@ def build_read(config: KernelConfig, *, parallel: bool, iterations: int) -> Call
         values: ti.types.ndarray(dtype=real, ndim=3), measures: ti.types.ndarray(dtype=real, ndim=2),
         u_x: vectors, u_y: vectors, u_z: vectors,
         d_x: vectors, d_y: vectors, d_z: vectors,
-        constants_of: ti.types.ndarray(dtype=vector, ndim=1), by_column: vectors, stiffness: vectors, fields: vectors,
+        constants_of: ti.types.ndarray(dtype=vector, ndim=1), by_column: vectors, fields: vectors,
     ):  # fmt: skip
         """Read and measure a sheet.
 
@@ -277,7 +274,7 @@ def build_read(config: KernelConfig, *, parallel: bool, iterations: int) -> Call
             differences: whether to read d instead of u.
             values: output [m], shape (rows, cols, 3).
             measures: output, shape (rows, measures).
-            u_x, u_y, u_z, d_x, d_y, d_z, constants_of, by_column, stiffness, fields: `SheetArrays.all`.
+            u_x, u_y, u_z, d_x, d_y, d_z, constants_of, by_column, fields: `SheetArrays.all`.
         """
         ti.loop_config(serialize=not parallel)
         for index in range(rows * iterations):
@@ -286,7 +283,7 @@ def build_read(config: KernelConfig, *, parallel: bool, iterations: int) -> Call
                 width, p = strip + 2, first + i
                 constants = [constants_of[n][0] for n in ti.static(range(count))]
                 u, d = ti.static((u_x, u_y, u_z), (d_x, d_y, d_z))
-                sheet = ti.static(KernelSheet(u, d, by_column, stiffness, fields, constants, rows, width))
+                sheet = ti.static(KernelSheet(u, d, by_column, fields, constants, rows, width))
                 kind = ti.select(i == rows - 1, 2, ti.select(i == 0, 0, 1))
                 sums = [vector(0) for _ in ti.static(reductions)]
                 for b in range(1, strip + 1):
@@ -295,7 +292,7 @@ def build_read(config: KernelConfig, *, parallel: bool, iterations: int) -> Call
                         change = d[c][i * width + b]
                         motion += change * change
                     if ti.static(config.by_area):
-                        motion *= sheet.by_column[(AREA_SHARE + kind) * width + b]
+                        motion *= area_share(sheet, i, kind, b)
                     sums[SQUARED_MOTION] += motion
                     for measure in ti.static(measuring):
                         measure(sums, sheet, p, i, kind, b)

@@ -275,7 +275,7 @@ def build_advance(config: KernelConfig, *, parallel: bool) -> Callable[..., None
         carried_x: vectors, carried_y: vectors, carried_z: vectors,
         u_x: vectors, u_y: vectors, u_z: vectors,
         d_x: vectors, d_y: vectors, d_z: vectors,
-        constants_of: ti.types.ndarray(dtype=vector, ndim=1), by_column: vectors, stiffness: vectors, fields: vectors,
+        constants_of: ti.types.ndarray(dtype=vector, ndim=1), by_column: vectors, fields: vectors,
     ):  # fmt: skip
         """Advance by the steps of a launch, from the workers' recorded progress on.
 
@@ -284,7 +284,7 @@ def build_advance(config: KernelConfig, *, parallel: bool) -> Callable[..., None
             progress: integers of the workers, in and out, shape (workers x WORKER_STRIDE,).
             loads: load table of the launch, shape (steps, columns).
             carried_x, carried_y, carried_z: forces carried to the next row [N], rows per worker and step of a pass.
-            u_x, u_y, u_z, d_x, d_y, d_z, constants_of, by_column, stiffness, fields: `SheetArrays.all`.
+            u_x, u_y, u_z, d_x, d_y, d_z, constants_of, by_column, fields: `SheetArrays.all`.
         """
         ti.loop_config(serialize=not parallel)
         for index in range(ti.cast(sizes[WORKERS], ti.i32) * ITERATIONS_PER_THREAD):
@@ -293,7 +293,7 @@ def build_advance(config: KernelConfig, *, parallel: bool) -> Callable[..., None
                 rows, width = ti.cast(sizes[ROWS], ti.i32), ti.cast(sizes[STRIP], ti.i32) + 2
                 constants = [constants_of[n][0] for n in ti.static(range(constant_count))]
                 u, d = ti.static((u_x, u_y, u_z), (d_x, d_y, d_z))
-                sheet = ti.static(KernelSheet(u, d, by_column, stiffness, fields, constants, rows, width))
+                sheet = ti.static(KernelSheet(u, d, by_column, fields, constants, rows, width))
                 worker, workers = index // ITERATIONS_PER_THREAD, ti.cast(sizes[WORKERS], ti.i32)
                 first_row, end_row = ti.cast(sizes[FIRST_ROW], ti.i32), ti.cast(sizes[END_ROW], ti.i32)
                 low = first_row + (end_row - first_row) * worker // workers

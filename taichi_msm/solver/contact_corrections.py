@@ -10,8 +10,9 @@ from numpy.typing import NDArray
 
 from taichi_msm.solver.arrays import SheetArrays, SheetLayout
 from taichi_msm.system.runtime import compilation_options, ti
-from taichi_msm.terms.base import AREA_SHARE, KernelConfig
+from taichi_msm.terms.base import KernelConfig, KernelSheet
 from taichi_msm.terms.contact import CORRECTIONS, ContactTerm
+from taichi_msm.terms.points import build_point_functions
 
 
 def sum_corrections(layout: SheetLayout, arrays: SheetArrays, *, clear: bool) -> NDArray[np.float64]:
@@ -38,7 +39,7 @@ def _build_sum(config: KernelConfig) -> Callable[..., None]:
     """Build the kernel that sums the corrections in every row, per tool and component."""
     vector, vectors, lanes, serial = config.vector, config.vectors, config.lanes, config.lanes > 1
     first, count = config.first_field(ContactTerm), CORRECTIONS * len(config.require(ContactTerm).shapes)
-    by_area = config.by_area
+    by_area, area_share = config.by_area, build_point_functions(config).area_share
 
     @ti.kernel
     def add_up(
@@ -55,26 +56,26 @@ def _build_sum(config: KernelConfig) -> Callable[..., None]:
             fields: as in `SheetArrays`.
             sums: output [m], shape (tools x 3, rows).
         """
-        area_shares, corrections = ti.static(by_column, fields)
         ti.loop_config(serialize=serial)
         for i in range(rows):
             strip, kind = (cols + lanes - 1) // lanes, ti.select(i == rows - 1, 2, ti.select(i == 0, 0, 1))
             for component in range(count):
+                sheet = ti.static(KernelSheet((), (), by_column, fields, (), rows, strip + 2))
                 row, largest, total = ((first + component) * rows + i) * (strip + 2), vector(0), ti.cast(0, ti.f64)
                 for b in range(1, strip + 1):
-                    correction = corrections[row + b]
+                    correction = fields[row + b]
                     largest = ti.max(largest, ti.max(correction, correction * (-1)))
                 # Most rows touch no tool.
                 if largest.max() > 0:
                     for lane in ti.static(range(lanes)):
                         for b in range(1, strip + 1):
-                            area_share = ti.cast(1, ti.f64)
+                            share = vector(1)
                             if ti.static(by_area):
-                                area_share = ti.cast(area_shares[(AREA_SHARE + kind) * (strip + 2) + b][lane], ti.f64)
-                            total += area_share * ti.cast(corrections[row + b][lane], ti.f64)
+                                share = area_share(sheet, i, kind, b)
+                            total += ti.cast(share[lane], ti.f64) * ti.cast(fields[row + b][lane], ti.f64)
                     if clear:
                         for b in range(1, strip + 1):
-                            corrections[row + b] = vector(0)
+                            fields[row + b] = vector(0)
                 sums[component, i] = total
 
     return add_up

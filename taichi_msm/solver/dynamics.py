@@ -180,9 +180,9 @@ class ForceRecorder:
         return tuple(forces)
 
     def _decay_sum(self, index: int, at: Array) -> float:
-        probe, sheet = self._plan.scene.probes[index], self._plan.scene.sheet
+        probe = self._plan.scene.probes[index]
         if self._loads[index].moves:
-            return float(decay(probe, sheet, at)[~self._plan.fixed].sum())
+            return float(decay(probe, self._plan, at)[~self._plan.fixed].sum())
         if index not in self._stationary:
-            self._stationary[index] = float(decay(probe, sheet)[~self._plan.fixed].sum())
+            self._stationary[index] = float(decay(probe, self._plan)[~self._plan.fixed].sum())
         return self._stationary[index]

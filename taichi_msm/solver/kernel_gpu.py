@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from taichi_msm.solver.arrays import InitialData, SheetArrays, SheetLayout, StepKernel, build_point_step, build_read
 from taichi_msm.system.runtime import compilation_options, ti
-from taichi_msm.terms.base import DX, DY, HAS_LEFT, HAS_RIGHT, Entry, KernelConfig, KernelRow, KernelSheet
+from taichi_msm.terms.base import DX, DY, HAS_LEFT, HAS_RIGHT, Entry, KernelConfig, KernelRow, KernelSheet, RowPair
 from taichi_msm.terms.bending import BendingTerm
 from taichi_msm.terms.springs import SpringTerm
 
@@ -55,41 +55,33 @@ def _build_step(config: KernelConfig) -> Callable[..., None]:
     """Build the Taichi function that steps a mass point."""
     real, vector, columns, springs = config.real, config.vector, config.first_column(None), config.require(SpringTerm)
     structural, shear, open_edges = springs.structural, springs.shear, springs.open_edges
-    row_share, column_share = springs.build_cell_shares(config)
     force_on_right, force_on_other = springs.build_spring_forces(config)
-    row_stiffness, column_stiffness, diagonal_stiffness = springs.build_stiffness(config)
     move, corrections = build_point_step(config), [term.build_correction(config) for term in config.terms]
     resolving = [correction.resolve for correction in corrections if correction]
 
     @ti.func
-    def row_force(sheet: ti.template(), p, q, lower, b, row_exists, up):
-        """Return the force of entry b of row p on row q, `up` [m] above, summed in the order of the CPU kernel."""
-        u, dx = [sheet.u[c][p * sheet.width + b] for c in ti.static(range(3))], sheet.constants[DX]
+    def row_force(sheet: ti.template(), pair: ti.template(), p, q, b, row_exists):
+        """Return the force of entry b of row p on row q of u, summed in the order of the CPU kernel."""
+        u = [sheet.u[c][p * sheet.width + b] for c in ti.static(range(3))]
         force = [vector(0) for _ in ti.static(range(3))]
         for right in ti.static((-1, 0, 1)):
             if ti.static(structural if right == 0 else shear):
-                k, length, exists = vector(1), ti.abs(up), vector(1)
-                if ti.static(right == 0):
-                    k *= column_stiffness(sheet, lower, b)
-                    exists = column_share(sheet, exists, b)
-                else:
-                    k *= diagonal_stiffness(sheet, lower, b + ti.static(min(right, 0)))
-                    length = ti.sqrt(dx * dx + up * up)
+                exists = vector(1)
                 if ti.static(right != 0 and open_edges):
                     exists = sheet.by_column[ti.static(HAS_LEFT if right < 0 else HAS_RIGHT) * sheet.width + b]
-                pull = force_on_other(sheet, q * sheet.width + b + right, right, u, up, length, k, exists * row_exists)
+                pull = force_on_other(sheet, pair, q * sheet.width + b + right, right, b, u, exists * row_exists)
                 for c in ti.static(range(3)):
                     force[c] += pull[c]
         return force
 
     @ti.func
-    def right_force(sheet: ti.template(), p, i, kind, b):
-        """Return the force of entry b of row p, which is row i of the sheet, on its right neighbour."""
+    def right_force(sheet: ti.template(), pair: ti.template(), p, b):
+        """Return the force of entry b of row p of u on its right neighbour."""
         exists, entry = vector(1), p * sheet.width + b
         if ti.static(open_edges):
             exists = sheet.by_column[HAS_RIGHT * sheet.width + b]
-        k, u = row_stiffness(sheet, i, kind, b) * vector(1), [sheet.u[c][entry] for c in ti.static(range(3))]
-        return force_on_right(sheet, entry + 1, u, k, row_share(exists, kind))
+        u = [sheet.u[c][entry] for c in ti.static(range(3))]
+        return force_on_right(sheet, pair, entry + 1, b, u, exists)
 
     @ti.func
     def step(sheet: ti.template(), loads: ti.template(), buffer, i, b, n):
@@ -98,13 +90,16 @@ def _build_step(config: KernelConfig) -> Callable[..., None]:
         p = buffer * (rows + 2) + i + 1
         kind = ti.select(i == rows - 1, 2, ti.select(i == 0, 0, 1))
         below, above = ti.cast(i < rows - 1, real), ti.cast(i > 0, real)
-        dy = sheet.constants[DY]
-        on_below = row_force(sheet, p, p + 1, i + 1, b, below, 0 - dy)
-        on_above = row_force(sheet, p, p - 1, i, b, above, dy)
+        dx, dy = sheet.constants[DX], sheet.constants[DY]
+        diagonal = ti.sqrt(dx * dx + dy * dy)
+        with_below = ti.static(RowPair(i, kind, ti.min(i + 1, rows - 1), i, 0 - dy, diagonal))
+        with_above = ti.static(RowPair(i, kind, ti.max(i - 1, 0), i - 1, dy, diagonal))
+        on_below = row_force(sheet, with_below, p, p + 1, b, below)
+        on_above = row_force(sheet, with_above, p, p - 1, b, above)
         force = [0 - (on_below[c] + on_above[c]) for c in ti.static(range(3))]
         if ti.static(structural):
-            on_right = right_force(sheet, p, i, kind, b)
-            of_left = right_force(sheet, p, i, kind, b - 1)
+            on_right = right_force(sheet, with_below, p, b)
+            of_left = right_force(sheet, with_below, p, b - 1)
             for c in ti.static(range(3)):
                 force[c] += of_left[c] - on_right[c]
         now = [loads[n, c] for c in ti.static(range(columns))]
@@ -132,7 +127,7 @@ def _build_advance(config: KernelConfig) -> Callable[..., None]:
         buffer: ti.i32, count: ti.i32, rows: ti.i32, cols: ti.i32, loads: ti.types.ndarray(dtype=real, ndim=2),
         u_x: vectors, u_y: vectors, u_z: vectors,
         d_x: vectors, d_y: vectors, d_z: vectors,
-        constants_of: ti.types.ndarray(dtype=vector, ndim=1), by_column: vectors, stiffness: vectors, fields: vectors,
+        constants_of: ti.types.ndarray(dtype=vector, ndim=1), by_column: vectors, fields: vectors,
     ):  # fmt: skip
         """Advance by the steps of a launch.
 
@@ -142,7 +137,7 @@ def _build_advance(config: KernelConfig) -> Callable[..., None]:
             rows: number of rows of the sheet.
             cols: number of columns of the sheet.
             loads: load table of the launch, shape (steps, columns).
-            u_x, u_y, u_z, d_x, d_y, d_z, constants_of, by_column, stiffness, fields: `SheetArrays.all`.
+            u_x, u_y, u_z, d_x, d_y, d_z, constants_of, by_column, fields: `SheetArrays.all`.
         """
         for n in ti.static(range(STEPS_PER_LAUNCH)):
             for store_moment in ti.static(storing):
@@ -150,14 +145,14 @@ def _build_advance(config: KernelConfig) -> Callable[..., None]:
                     if n < count:
                         constants = [constants_of[m][0] for m in ti.static(range(constant_count))]
                         u, d = ti.static((u_x, u_y, u_z), (d_x, d_y, d_z))
-                        sheet = ti.static(KernelSheet(u, d, by_column, stiffness, fields, constants, rows, cols + 2))
+                        sheet = ti.static(KernelSheet(u, d, by_column, fields, constants, rows, cols + 2))
                         p = (buffer + n) % 2 * (rows + 2) + i + 1
                         store_moment(sheet, i, p - 1, p, p + 1, b, 2 * (rows + 2) + i + 1)
             for i, b in ti.ndrange(rows, (1, cols + 1)):
                 if n < count:
                     constants = [constants_of[m][0] for m in ti.static(range(constant_count))]
                     u, d = ti.static((u_x, u_y, u_z), (d_x, d_y, d_z))
-                    sheet = ti.static(KernelSheet(u, d, by_column, stiffness, fields, constants, rows, cols + 2))
+                    sheet = ti.static(KernelSheet(u, d, by_column, fields, constants, rows, cols + 2))
                     step(sheet, loads, (buffer + n) % 2, i, b, n)
 
     return advance

@@ -38,8 +38,9 @@ from taichi_msm.solver.arrays import (
 )
 from taichi_msm.solver.bands import MOMENT_ROWS, RowBand, build_fill_halo, build_step_row
 from taichi_msm.system.runtime import compilation_options, ti, write_vectors
-from taichi_msm.terms.base import MOBILITY, Entry, KernelConfig, KernelRow, KernelSheet, RestCorrection
+from taichi_msm.terms.base import Entry, KernelConfig, KernelRow, KernelSheet, RestCorrection
 from taichi_msm.terms.bending import BendingTerm
+from taichi_msm.terms.points import build_point_functions
 from taichi_msm.terms.springs import SpringTerm
 
 # Arguments of a launch
@@ -76,7 +77,6 @@ class RestSheet(NamedTuple):
     u: Any
     d: Any
     by_column: Any
-    stiffness: Any
     fields: Any
     constants: Any
     rows: Any
@@ -157,7 +157,7 @@ def _corrections(config: KernelConfig) -> list[RestCorrection]:
 def _build_store(config: KernelConfig) -> Callable[..., None]:
     """Build the Taichi function that stores the force on an entry and adds to the reductions of FIRE."""
     vector, forces = config.vector, build_point_forces(config)
-    removals = [correction.remove for correction in _corrections(config)]
+    removals, mobility = [each.remove for each in _corrections(config)], build_point_functions(config).mobility
 
     @ti.func
     def store(sheet: ti.template(), entry: ti.template(), _target, force: ti.template(), now: ti.template()):
@@ -165,7 +165,7 @@ def _build_store(config: KernelConfig) -> Callable[..., None]:
         for add in ti.static(forces):
             add(force, sheet, entry, now)
         width, at = sheet.width, entry.row.i * sheet.width + entry.b
-        moves = sheet.by_column[(MOBILITY + entry.row.kind) * width + entry.b] > 0
+        moves = mobility(sheet, entry.row.i, entry.row.kind, entry.b) > 0
         inverse = sheet.work[at]
         power, square, motion = vector(0), vector(0), vector(0)
         for c in ti.static(range(3)):
@@ -252,7 +252,7 @@ def _build_relax(config: KernelConfig) -> Callable[..., None]:
         q_x: vectors, q_y: vectors, q_z: vectors, work: vectors,
         u_x: vectors, u_y: vectors, u_z: vectors,
         d_x: vectors, d_y: vectors, d_z: vectors,
-        constants_of: ti.types.ndarray(dtype=vector, ndim=1), by_column: vectors, stiffness: vectors, fields: vectors,
+        constants_of: ti.types.ndarray(dtype=vector, ndim=1), by_column: vectors, fields: vectors,
     ):  # fmt: skip
         """Evaluate the forces and move the mass points, see `Relaxation.relax`.
 
@@ -261,7 +261,7 @@ def _build_relax(config: KernelConfig) -> Callable[..., None]:
             row: row of the load table, shape (1, columns).
             q_x, q_y, q_z: momenta [N].
             work: 1 / M of every mass point [m/N], followed by SUMS rows of reductions.
-            u_x, u_y, u_z, d_x, d_y, d_z, constants_of, by_column, stiffness, fields: `SheetArrays.all`.
+            u_x, u_y, u_z, d_x, d_y, d_z, constants_of, by_column, fields: `SheetArrays.all`.
         """
         ti.loop_config(serialize=True)
         for _ in range(1):
@@ -270,7 +270,7 @@ def _build_relax(config: KernelConfig) -> Callable[..., None]:
             count = ti.cast(fire[COUNT], ti.i32)
             constants = [constants_of[n][0] for n in ti.static(range(constant_count))]
             u, forces, q = ti.static((u_x, u_y, u_z), (d_x, d_y, d_z), (q_x, q_y, q_z))
-            sheet = ti.static(RestSheet(u, forces, by_column, stiffness, fields, constants, rows, width, q, work))
+            sheet = ti.static(RestSheet(u, forces, by_column, fields, constants, rows, width, q, work))
             band = ti.static(RowBand(0, 1, low, high, 1, rows, 0, fire))
             if fire[PLACED] > 0:
                 for i in range(low, high):
@@ -319,7 +319,7 @@ def _build_relax(config: KernelConfig) -> Callable[..., None]:
 def _build_scale(config: KernelConfig) -> Callable[..., None]:
     """Build the kernel of `Relaxation.scale`."""
     real, vector, vectors, columns = config.real, config.vector, config.vectors, config.first_column(None)
-    constant_count = config.first_constant(None)
+    constant_count, mobility = config.first_constant(None), build_point_functions(config).mobility
     max_spring_force = config.require(SpringTerm).build_max_spring_force(config)
     forces = [
         force for term in config.terms if not isinstance(term, BendingTerm) for force in term.build_forces(config)
@@ -331,7 +331,7 @@ def _build_scale(config: KernelConfig) -> Callable[..., None]:
         result: ti.types.ndarray(dtype=real, ndim=1), row: ti.types.ndarray(dtype=real, ndim=2),
         u_x: vectors, u_y: vectors, u_z: vectors,
         d_x: vectors, d_y: vectors, d_z: vectors,
-        constants_of: ti.types.ndarray(dtype=vector, ndim=1), by_column: vectors, stiffness: vectors, fields: vectors,
+        constants_of: ti.types.ndarray(dtype=vector, ndim=1), by_column: vectors, fields: vectors,
     ):  # fmt: skip
         """Compute the square of the largest force of a spring, a load or the foundation on a mass point.
 
@@ -340,13 +340,13 @@ def _build_scale(config: KernelConfig) -> Callable[..., None]:
             width: number of entries of a row.
             result: output, the square [N^2], shape (1,).
             row: row of the load table, shape (1, columns).
-            u_x, u_y, u_z, d_x, d_y, d_z, constants_of, by_column, stiffness, fields: `SheetArrays.all`.
+            u_x, u_y, u_z, d_x, d_y, d_z, constants_of, by_column, fields: `SheetArrays.all`.
         """
         ti.loop_config(serialize=True)
         for _ in range(1):
             constants = [constants_of[n][0] for n in ti.static(range(constant_count))]
             u, d = ti.static((u_x, u_y, u_z), (d_x, d_y, d_z))
-            sheet = ti.static(KernelSheet(u, d, by_column, stiffness, fields, constants, rows, width))
+            sheet = ti.static(KernelSheet(u, d, by_column, fields, constants, rows, width))
             now = [row[0, c] for c in ti.static(range(columns))]
             largest = vector(0)
             for i in range(rows):
@@ -356,7 +356,7 @@ def _build_scale(config: KernelConfig) -> Callable[..., None]:
                     displacement = [u[c][i * width + b] for c in ti.static(range(3))]
                     entry = ti.static(Entry(line, b, displacement))
                     largest = ti.max(largest, max_spring_force(sheet, entry))
-                    moves = sheet.by_column[(MOBILITY + kind) * width + b] > 0
+                    moves = mobility(sheet, i, kind, b) > 0
                     for add in ti.static(forces):
                         force = [vector(0) for _ in ti.static(range(3))]
                         add(force, sheet, entry, now)

@@ -65,7 +65,7 @@ class QuasiStatics(SheetSolver[Relaxation]):
     @staticmethod
     def _build_kernel(plan: Plan, layout: SheetLayout, start: InitialData) -> Relaxation:
         # A mass point without stiffness would have mass 0.
-        return Relaxation(layout, start, np.maximum(fictitious_masses(plan), MIN_MAGNITUDE))
+        return Relaxation(layout, start, np.maximum(fictitious_masses(plan.material, plan.scene.sheet), MIN_MAGNITUDE))
 
     def _begin(self, state: State | None) -> None:
         super()._begin(state)

@@ -14,7 +14,7 @@ Contact with position-controlled tools is resolved afterwards, in the rows that 
 from collections.abc import Callable
 
 from taichi_msm.system.runtime import ti
-from taichi_msm.terms.base import DX, DY, HAS_LEFT, HAS_RIGHT, Correction, Entry, KernelConfig, build_max_lane
+from taichi_msm.terms.base import DX, DY, HAS_LEFT, HAS_RIGHT, Correction, Entry, KernelConfig, RowPair, build_max_lane
 from taichi_msm.terms.springs import SpringTerm
 
 
@@ -31,9 +31,7 @@ def build_pass_row(config: KernelConfig, move: Callable[..., None]) -> Callable[
     """
     vector, columns, springs = config.vector, config.first_column(None), config.require(SpringTerm)
     structural, shear, open_edges = springs.structural, springs.shear, springs.open_edges
-    row_share, column_share = springs.build_cell_shares(config)
     force_on_right, force_on_other = springs.build_spring_forces(config)
-    row_stiffness, column_stiffness, diagonal_stiffness = springs.build_stiffness(config)
 
     @ti.func
     def pass_row(
@@ -55,10 +53,11 @@ def build_pass_row(config: KernelConfig, move: Callable[..., None]) -> Callable[
             n: row of the load table.
             moving: whether to step the row.
         """
-        width, strip, i, kind = sheet.width, sheet.width - 2, line.i, line.kind
+        width, strip, i = sheet.width, sheet.width - 2, line.i
         diagonal = ti.sqrt(sheet.constants[DX] * sheet.constants[DX] + sheet.constants[DY] * sheet.constants[DY])
-        # The lower of the two rows.
-        lower = i + ti.select(up < 0, 1, 0)
+        # The sheet has no row above the first and none below the last one.
+        upper, other = i - ti.select(up < 0, 0, 1), ti.max(0, ti.min(i + ti.select(up < 0, 1, -1), sheet.rows - 1))
+        pair = ti.static(RowPair(i, line.kind, other, upper, up, diagonal))
         # Entry 0 of both rows of u and of the row of carried forces.
         row, next_at, carry = source * width, next_row * width, carried_row * width
         # Force of the left neighbour, and forces carried to the other row for the previous, this and the next entry.
@@ -69,13 +68,11 @@ def build_pass_row(config: KernelConfig, move: Callable[..., None]) -> Callable[
             has_right = sheet.by_column[HAS_RIGHT * width + 0]
         u = [sheet.u[c][row] for c in ti.static(range(3))]
         if ti.static(structural):
-            first = force_on_right(sheet, row + 1, u, row_stiffness(sheet, i, kind, 0), row_share(has_right, kind))
+            first = force_on_right(sheet, pair, row + 1, 0, u, has_right)
             for c in ti.static(range(3)):
                 left[c] = first[c]
         if ti.static(shear):
-            first_right = force_on_other(
-                sheet, next_at + 1, 1, u, up, diagonal, diagonal_stiffness(sheet, lower, 0), has_right * exists
-            )
+            first_right = force_on_other(sheet, pair, next_at + 1, 1, 0, u, has_right * exists)
             for c in ti.static(range(3)):
                 following[c] = first_right[c]
         # Read once, because the compiler must assume that stores to the arrays could change the table.
@@ -91,34 +88,24 @@ def build_pass_row(config: KernelConfig, move: Callable[..., None]) -> Callable[
             if ti.static(open_edges):
                 has_left, has_right = sheet.by_column[HAS_LEFT * width + b], sheet.by_column[HAS_RIGHT * width + b]
             if ti.static(shear):
-                to_left = force_on_other(
-                    sheet, next_at + b - 1, -1, u, up, diagonal, diagonal_stiffness(sheet, lower, b - 1),
-                    has_left * exists,
-                )  # fmt: skip
+                to_left = force_on_other(sheet, pair, next_at + b - 1, -1, b, u, has_left * exists)
                 for c in ti.static(range(3)):
                     force[c] = to_left[c]
                     last[c] += to_left[c]
             if ti.static(structural):
-                straight = force_on_other(
-                    sheet, next_at + b, 0, u, up, ti.abs(up), column_stiffness(sheet, lower, b),
-                    column_share(sheet, exists, b),
-                )  # fmt: skip
+                straight = force_on_other(sheet, pair, next_at + b, 0, b, u, exists)
                 for c in ti.static(range(3)):
                     force[c] += straight[c]
                     this[c] += straight[c]
             if ti.static(shear):
-                to_right = force_on_other(
-                    sheet, next_at + b + 1, 1, u, up, diagonal, diagonal_stiffness(sheet, lower, b), has_right * exists
-                )
+                to_right = force_on_other(sheet, pair, next_at + b + 1, 1, b, u, has_right * exists)
                 for c in ti.static(range(3)):
                     force[c] += to_right[c]
                     following[c] = to_right[c]
             for c in ti.static(range(3)):
                 force[c] = carried[c][carry + b] - force[c]
             if ti.static(structural):
-                right = force_on_right(
-                    sheet, row + b + 1, u, row_stiffness(sheet, i, kind, b), row_share(has_right, kind)
-                )
+                right = force_on_right(sheet, pair, row + b + 1, b, u, has_right)
                 for c in ti.static(range(3)):
                     force[c] += left[c] - right[c]
                     left[c] = right[c]
@@ -133,9 +120,7 @@ def build_pass_row(config: KernelConfig, move: Callable[..., None]) -> Callable[
                 has_left = sheet.by_column[HAS_LEFT * width + strip + 1]
             for c in ti.static(range(3)):
                 u[c] = sheet.u[c][row + strip + 1]
-            end = force_on_other(
-                sheet, next_at + strip, -1, u, up, diagonal, diagonal_stiffness(sheet, lower, strip), has_left * exists
-            )
+            end = force_on_other(sheet, pair, next_at + strip, -1, strip + 1, u, has_left * exists)
             for c in ti.static(range(3)):
                 this[c] += end[c]
         for c in ti.static(range(3)):

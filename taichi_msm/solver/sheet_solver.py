@@ -57,8 +57,14 @@ def choose_layout(plan: Plan, device: Device, cores: int | None = None) -> Sheet
         workers = max(1, min(cores, rows * cols // POINTS_PER_WORKER, (rows - sum(fixed_rows)) // 2))
     else:
         workers = 0
+    material, inner = plan.material, fixed[1:-1]
     config = base.KernelConfig(
-        precision, lanes(precision), plan.open_edges and plan.material.by_area, build_terms(plan)
+        precision,
+        lanes(precision),
+        by_area=plan.areas_vary and material.by_area,
+        by_point=material.shares is not None or bool((inner != inner[:1]).any()),
+        curved=material.springs is not None and material.springs.rest is not None,
+        terms=build_terms(plan),
     )
     if device.arch == "vulkan" and precision == "f64" and any(slot.moves for slot in plan.slots):
         raise DeviceError(
@@ -229,22 +235,26 @@ class SheetSolver(ABC, Generic[Kernel]):
 
 
 def _initial_data(plan: Plan, layout: SheetLayout, state: State | None) -> InitialData:
-    sheet = plan.scene.sheet
-    moves, column, areas = ~plan.fixed, np.arange(layout.cols), area_shares(sheet)
-    # One row of each kind: first, middle, last.
-    kinds = [0, layout.rows // 2, -1]
-    shares = areas[kinds] if layout.config.by_area else np.ones((3, layout.cols))
+    sheet, config = plan.scene.sheet, layout.config
+    column, areas, mobility = np.arange(layout.cols), area_shares(sheet), plan.mobility
     by_column = np.empty((base.COLUMN_ROWS, layout.cols))
-    by_column[base.MOBILITY : base.MOBILITY + 3] = moves[kinds] / shares
+    # One row of each kind: first, middle, last.
+    by_column[base.MOBILITY : base.MOBILITY + 3] = mobility[[0, layout.rows // 2, -1]]
     # Springs along columns read the shares of a middle row even in a sheet of two rows.
     by_column[base.AREA_SHARE : base.AREA_SHARE + 3] = areas[0], 2 * areas[0], areas[-1]
     by_column[base.REST_X] = axes(sheet)[0]
     by_column[base.HAS_LEFT] = column > 0
     by_column[base.HAS_RIGHT] = column < layout.cols - 1
-    of_terms = (constant for term in layout.config.terms for constant in term.constants(plan))
+    of_terms = (constant for term in config.terms for constant in term.constants(plan))
     constants = *spacing(sheet), sheet.size[0] / 2, *of_terms
-    fields = np.concatenate([term.fields(plan) for term in layout.config.terms])
+    fields = [term.fields(plan) for term in config.terms]
+    if config.curved:
+        assert plan.material.springs is not None
+        assert plan.material.springs.rest is not None
+        fields.insert(0, np.moveaxis(plan.material.springs.rest, -1, 0))
+    if config.by_point:
+        fields.insert(0, np.stack([mobility, plan.area_shares]))
+    all_fields = np.concatenate(fields)
     if state is not None and len(state.memory):
-        fields[layout.config.memory_fields] = state.memory
-    stiffness = layout.config.require(SpringTerm).stiffness_array(plan)
-    return InitialData(np.array(constants), by_column, fields, stiffness, state)
+        all_fields[config.memory_fields] = state.memory
+    return InitialData(np.array(constants), by_column, all_fields, state)

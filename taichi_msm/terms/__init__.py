@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from taichi_msm.model.plan import Plan
-from taichi_msm.model.sheet import Maps, Material, cell_factors, point_factors, spacing
+from taichi_msm.model.sheet import Maps, Material, cell_factors, point_areas, point_factors, spacing
 from taichi_msm.scene.scene import Scene
 from taichi_msm.scene.sheet import Sheet
 from taichi_msm.terms.base import Term
@@ -74,12 +74,14 @@ def memory_names(plan: Plan) -> tuple[str, ...]:
     return tuple(name for term in build_terms(plan) for name in term.memory)
 
 
-def fictitious_masses(plan: Plan) -> NDArray[np.float64]:
+def fictitious_masses(material: Material, sheet: Sheet) -> NDArray[np.float64]:
     """Compute fictitious masses of the mass points, shape (rows, cols) [N/m].
 
     In their dimensionless time every angular frequency of the sheet is at most 1.
     """
-    return np.sum([np.broadcast_to(term.node_stiffness_bounds(plan), plan.fixed.shape) for term in TERMS], axis=0)
+    return np.sum(
+        [np.broadcast_to(term.node_stiffness_bounds(material, sheet), sheet.points) for term in TERMS], axis=0
+    )
 
 
 def highest_frequency(material: Material, sheet: Sheet) -> float:
@@ -89,4 +91,7 @@ def highest_frequency(material: Material, sheet: Sheet) -> float:
         material: coefficients of the sheet.
         sheet: section `sheet` of the scene.
     """
-    return math.sqrt(sum(term.stiffness_bound(material, sheet) for term in TERMS) / material.mass)
+    if material.shares is None and material.springs is None:
+        return math.sqrt(sum(term.stiffness_bound(material, sheet) for term in TERMS) / material.mass)
+    shares = point_areas(material, sheet) if material.by_area else 1.0
+    return math.sqrt(float((fictitious_masses(material, sheet) / shares).max()) / material.mass)

@@ -20,10 +20,14 @@ from taichi_msm.scene.sheet import Sheet
 from taichi_msm.terms.law import Law, LawFunctions
 
 # Rows of the array `by_column`. MOBILITY and AREA_SHARE take three: for the first, inner and last rows of the sheet.
+# With `KernelConfig.by_point` both are the first fields instead.
 MOBILITY, AREA_SHARE, REST_X, HAS_LEFT, HAS_RIGHT, COLUMN_ROWS = 0, 3, 6, 7, 8, 9
 
 # Indices of the constants of a sheet: dx, dy and y of the first row [m], followed by the constants of its terms.
 DX, DY, TOP_Y, GEOMETRY_COUNT = range(4)
+
+# First fields, where mobility and area vary from point to point; where the sheet is curved, x, y and z at rest follow.
+POINT_FIELDS, REST_FIELDS = 2, 3
 
 # First column of the load table: the gain of the step, displacement per force [m/N]. Columns of the terms follow.
 GAIN, STEP_COLUMNS = 0, 1
@@ -65,9 +69,9 @@ class Term(ABC):
         return 0.0
 
     @classmethod
-    def node_stiffness_bounds(cls, plan: Plan) -> NDArray[Any] | float:
+    def node_stiffness_bounds(cls, material: Material, sheet: Sheet) -> NDArray[Any] | float:
         """Bound the term's stiffness at each mass point [N/m], shape (rows, cols) or ()."""
-        return cls.stiffness_bound(plan.material, plan.scene.sheet)
+        return cls.stiffness_bound(material, sheet)
 
     def constants(self, plan: Plan) -> tuple[float, ...]:
         """Return the term's constants, `constant_count` numbers."""
@@ -196,7 +200,9 @@ class KernelConfig:
 
     precision: str  # f32 or f64
     lanes: int  # number of lanes of a vector, one for each strip of columns
-    by_area: bool  # whether mass points at an open edge are lighter, because they belong to fewer cells
+    by_area: bool  # whether the masses of mass points are proportional to their areas, which vary
+    by_point: bool  # whether mobility and area are fields, one number per mass point, instead of numbers per column
+    curved: bool  # whether the rest positions are fields
     terms: tuple[Term, ...]  # terms of the scene in the order of `terms.TERMS`, always with springs and probes
 
     @property
@@ -269,7 +275,8 @@ class KernelConfig:
 
     def first_field(self, kind: type[Term] | None) -> int:
         """Return the index of a term's first field; with None, the number of fields."""
-        return sum(term.field_count for term in self._before(kind))
+        own = POINT_FIELDS * self.by_point + REST_FIELDS * self.curved
+        return own + sum(term.field_count for term in self._before(kind))
 
     @property
     def memory_fields(self) -> list[int]:
@@ -314,7 +321,6 @@ class KernelSheet(NamedTuple):
     u: Any  # displacements [m], with bending also moments, as three arrays for x, y and z
     d: Any  # last differences [m], as three arrays
     by_column: Any
-    stiffness: Any
     fields: Any
     constants: Any  # of the sheet and its terms, as a list of variables
     rows: Any  # number of rows
@@ -329,6 +335,17 @@ class KernelRow(NamedTuple):
     before: Any  # with bending, row of u with the moments of the previous row
     at: Any  # with bending, row of u with the moments of row i
     after: Any  # with bending, row of u with the moments of the next row
+
+
+class RowPair(NamedTuple):
+    """A row and the next row of a pass within a kernel."""
+
+    i: Any  # index of the row
+    kind: Any  # as in `KernelRow`
+    other: Any  # index of the next row
+    upper: Any  # index of the upper of the two
+    up: Any  # y of the next row minus y of the row, on a flat sheet at rest [m]
+    diagonal: Any  # length of the diagonals of a cell, on a flat sheet at rest [m]
 
 
 class Entry(NamedTuple):

@@ -39,17 +39,8 @@ from taichi_msm.model.tools import GRIP_RADII, Clamp
 from taichi_msm.scene.section import FRAME_TOLERANCE
 from taichi_msm.shapes import SHAPES
 from taichi_msm.shapes.shape import MIN_DISTANCE_M
-from taichi_msm.terms.base import (
-    DY,
-    MOBILITY,
-    REST_X,
-    TOP_Y,
-    Correction,
-    KernelConfig,
-    RestCorrection,
-    Term,
-    build_max_lane,
-)
+from taichi_msm.terms.base import DY, TOP_Y, Correction, KernelConfig, RestCorrection, Term, build_max_lane
+from taichi_msm.terms.points import build_point_functions
 
 # Columns of the load table. For all tools: the weight of the step's corrections. For each tool: the tip's centre after
 # and before the step; the state of its grip, and the tool's displacement since the grip began; axis, length, radius and
@@ -195,18 +186,15 @@ class ContactTerm(Term):
         ti, vector, tools, has_friction = config.ti, config.vector, len(self.shapes), self.has_friction
         (first_field, grip_field, base), grips = self._places(config), self.grips
         weight, max_lane = config.first_column(ContactTerm) + WEIGHT, build_max_lane(config)
+        mobility, _, rest_position = build_point_functions(config)
         penetrations = [_build_penetration(config, shape) for shape in self.shapes]
 
         @ti.func
         def resolve(sheet: ti.template(), i, kind, at, b, now: ti.template()):
             rows, entry, point = sheet.rows, at * sheet.width + b, i * sheet.width + b
-            rest = [
-                sheet.by_column[REST_X * sheet.width + b],
-                vector(sheet.constants[TOP_Y] - i * sheet.constants[DY]),
-                vector(0),
-            ]
+            rest = rest_position(sheet, i, b)
             u, d = [sheet.u[c][entry] for c in ti.static(range(3))], [sheet.d[c][point] for c in ti.static(range(3))]
-            free = ti.select(sheet.by_column[(MOBILITY + kind) * sheet.width + b] > 0, vector(1), vector(0))
+            free = ti.select(mobility(sheet, i, kind, b) > 0, vector(1), vector(0))
             held = vector(0)
             if ti.static(grips):
                 held = sheet.fields[(grip_field + HOLDER) * rows * sheet.width + point]
@@ -301,6 +289,7 @@ class ContactTerm(Term):
         """Build the function that projects mass points and their momenta out of the tools, and moves held ones."""
         ti, vector, tools, grips = config.ti, config.vector, len(self.shapes), self.grips
         (first_field, grip_field, base), iterations = self._places(config), self._iterations
+        mobility, _, rest_position = build_point_functions(config)
         penetrations = [_build_penetration(config, shape) for shape in self.shapes]
         # Holders, and the columns with the shift of their mass points: of grips, and of rough tools.
         holders = [(tool + 1, base[tool] + GRIP_SHIFT) for tool in range(tools)]
@@ -309,13 +298,9 @@ class ContactTerm(Term):
         @ti.func
         def project(sheet: ti.template(), i, kind, b, now: ti.template()):
             field, at = sheet.rows * sheet.width, i * sheet.width + b
-            rest = [
-                sheet.by_column[REST_X * sheet.width + b],
-                vector(sheet.constants[TOP_Y] - i * sheet.constants[DY]),
-                vector(0),
-            ]
+            rest = rest_position(sheet, i, b)
             u, q = [sheet.u[c][at] for c in ti.static(range(3))], [sheet.q[c][at] for c in ti.static(range(3))]
-            free = ti.select(sheet.by_column[(MOBILITY + kind) * sheet.width + b] > 0, vector(1), vector(0))
+            free = ti.select(mobility(sheet, i, kind, b) > 0, vector(1), vector(0))
             if ti.static(grips):
                 held = sheet.fields[(grip_field + HOLDER) * field + at]
                 for holder, shift in ti.static(holders):

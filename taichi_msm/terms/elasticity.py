@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterator
 from typing import NamedTuple
 
@@ -11,12 +10,11 @@ from numpy.typing import NDArray
 
 from taichi_msm.arithmetic import NUMPY
 from taichi_msm.model.plan import Plan
-from taichi_msm.model.sheet import area_shares, spacing
+from taichi_msm.model.sheet import rest_positions, spacing
 from taichi_msm.terms.law import LawFunctions, law_parameters, spring_law
-from taichi_msm.terms.springs import spring_stiffness
+from taichi_msm.terms.springs import Window, assemble_springs, spring_ends
 
 Array = NDArray[np.float64]
-Window = tuple[slice, slice]
 
 
 class Elongation(NamedTuple):
@@ -33,8 +31,8 @@ class SpringFamily(NamedTuple):
 
     start: Window  # slices of the mass points at the start of each spring
     end: Window  # slices of the mass points at the end, below or to the right of the start
-    offset: Array  # vector from start to end at rest [m], shape (3,)
-    length: float  # at rest [m]
+    offset: Array  # vector from start to end at rest [m], shape (..., 3)
+    length: Array  # at rest [m], shape (...)
     stiffness: Array  # k - tau of each spring [N/m], shape (...) as selected by `start`
     tension: Array  # tau of each spring, its tension at rest divided by its length [N/m], shape (...)
     law: LawFunctions
@@ -90,26 +88,14 @@ class SpringFamily(NamedTuple):
 
 def spring_families(plan: Plan) -> Iterator[SpringFamily]:
     """Build the families of springs along rows, along columns and along both diagonals."""
-    (rows, cols), (dx, dy), material = plan.scene.sheet.points, spacing(plan.scene.sheet), plan.material
-    factors = np.ones((rows - 1, cols - 1)) if material.factors is None else material.factors
-    along_rows, along_columns, diagonals = spring_stiffness(material, factors)
-    law = spring_law(material.stiffening).build(NUMPY)
-    # The tension of a spring at rest does not depend on the map; at an edge of tissue it is half, like the stiffness.
-    shares = (np.where(np.isin(np.arange(count), (0, count - 1)), 0.5, 1.0) for count in (rows, cols))
-    row_shares, column_shares = np.ix_(*shares) if material.by_area else (1.0, 1.0)
-    for down, right, stiffness, unmapped in (
-        (0, 1, along_rows, material.across * row_shares),
-        (1, 0, along_columns, material.down * column_shares),
-        (1, 1, diagonals, material.shear),
-        (1, -1, diagonals, material.shear),
-    ):
-        start = slice(0, rows - down), slice(max(0, -right), cols - max(0, right))
-        end = slice(down, rows), slice(max(0, right), cols - max(0, -right))
-        length = math.hypot(right * dx, down * dy)
-        tension = np.broadcast_to(material.tension * unmapped, stiffness.shape)
-        offset = np.array([right * dx, -down * dy, 0.0])
+    material, sheet = plan.material, plan.scene.sheet
+    springs, law = assemble_springs(material, sheet.points), spring_law(material.stiffening).build(NUMPY)
+    rest = rest_positions(sheet) if springs.rest is None else springs.rest
+    for k, tension, (start, end) in zip(springs.stiffness, springs.tension, spring_ends(sheet.points), strict=True):
+        offset = rest[end] - rest[start]
+        length = np.sqrt((offset**2).sum(axis=-1))
         parameters = law_parameters(material.stiffening, length)
-        yield SpringFamily(start, end, offset, length, stiffness - tension, tension, law, parameters)
+        yield SpringFamily(start, end, offset, length, k - tension, tension, law, parameters)
 
 
 def energy_density(plan: Plan, displacement: Array) -> Array:
@@ -130,4 +116,4 @@ def energy_density(plan: Plan, displacement: Array) -> Array:
         energy = family.energy(displacement)
         by_point[family.start] += energy / 2
         by_point[family.end] += energy / 2
-    return by_point / (dx * dy * area_shares(plan.scene.sheet))
+    return by_point / (dx * dy * plan.area_shares)

@@ -19,11 +19,12 @@ from typing_extensions import Self
 from taichi_msm.arithmetic import NUMPY
 from taichi_msm.model.loads import Schedule
 from taichi_msm.model.plan import Plan
-from taichi_msm.model.sheet import Material, area_shares, spacing
+from taichi_msm.model.sheet import Material, spacing
 from taichi_msm.scene.scene import Scene
 from taichi_msm.scene.sheet import Foundation, Sheet
-from taichi_msm.terms.base import AREA_SHARE, KernelConfig, Term
+from taichi_msm.terms.base import KernelConfig, Term
 from taichi_msm.terms.law import LockingLaw, build_locking, law_parameters, make_stiffening
+from taichi_msm.terms.points import build_point_functions
 
 
 @dataclass(frozen=True)
@@ -58,7 +59,8 @@ class FoundationTerm(Term):
         mapped = material.virtual_factors is not None
         if material.virtual == 0:
             return None
-        return cls(plan.open_edges and material.by_area and not mapped, mapped, material.virtual_stiffening is not None)
+        by_area = plan.areas_vary and material.by_area and not mapped
+        return cls(by_area, mapped, material.virtual_stiffening is not None)
 
     @staticmethod
     def stiffness_bound(material: Material, sheet: Sheet) -> float:
@@ -66,9 +68,9 @@ class FoundationTerm(Term):
         return _steepest(material) * (1.0 if factors is None else float(factors.max()))
 
     @classmethod
-    def node_stiffness_bounds(cls, plan: Plan) -> NDArray[Any] | float:
-        factors = plan.material.virtual_factors
-        return _steepest(plan.material) * (1.0 if factors is None else factors)
+    def node_stiffness_bounds(cls, material: Material, sheet: Sheet) -> NDArray[Any] | float:
+        factors = 1.0 if material.virtual_factors is None else material.virtual_factors
+        return _steepest(material) * factors * (1.0 if material.shares is None else material.shares)
 
     @property
     def column_count(self) -> int:
@@ -138,13 +140,14 @@ class FoundationTerm(Term):
     def build_stiffness(self, config: KernelConfig) -> Callable[..., Any]:
         """Build the Taichi function stiffness_at(sheet, entry, k), where k is the stiffness of a whole cell."""
         ti, mapped, by_area, field = config.ti, self.mapped, self.by_area, config.first_field(FoundationTerm)
+        area_share = build_point_functions(config).area_share
 
         @ti.func
         def stiffness_at(sheet: ti.template(), entry: ti.template(), k):
             if ti.static(mapped):
                 return k * sheet.fields[(field * sheet.rows + entry.row.i) * sheet.width + entry.b]
             elif ti.static(by_area):  # noqa: RET505  # Taichi would compile the rest as well.
-                return k * sheet.by_column[(AREA_SHARE + entry.row.kind) * sheet.width + entry.b]
+                return k * area_share(sheet, entry.row.i, entry.row.kind, entry.b)
             else:
                 return k
 
@@ -238,5 +241,5 @@ def foundation_tangent(material: Material, k: NDArray[Any], displacement: NDArra
 def point_shares(plan: Plan) -> NDArray[Any]:
     """Return the factor of K at each mass point, map times share of a cell's area, shape (rows, cols)."""
     material = plan.material
-    shares = area_shares(plan.scene.sheet) if material.by_area else np.ones(plan.fixed.shape)
+    shares = plan.area_shares if material.by_area else np.ones(plan.fixed.shape)
     return shares if material.virtual_factors is None else material.virtual_factors * shares

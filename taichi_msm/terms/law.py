@@ -54,12 +54,14 @@ class LawFunctions(NamedTuple):
             derivatives of `pull` with respect to the logarithm of the lock and to the factor.
         energy: energy(k, tau, square_strain, *parameters) with square_strain = (L^2 - L0^2) / L0^2, twice the energy
             divided by L0^2, without tau q^2 [N/m].
+        at_length: at_length(length, *parameters), the parameters of a spring of this length from those of 1 m.
     """
 
     pull: Callable[..., Any]
     derivatives: Callable[..., Any]
     parameter_derivatives: Callable[..., Any]
     energy: Callable[..., Any]
+    at_length: Callable[..., Any]
 
 
 class Law(ABC):
@@ -102,7 +104,10 @@ class LinearLaw(Law):
             e = square_strain / (1 + sqrt(maximum(square_strain + 1, 0)))
             return e * e * k
 
-        return LawFunctions(pull, derivatives, parameter_derivatives, energy)
+        def at_length(length):
+            return ()
+
+        return LawFunctions(pull, derivatives, parameter_derivatives, energy, at_length)
 
 
 LINEAR = LinearLaw()
@@ -213,7 +218,10 @@ class LockingLaw(Law):
             e = square_strain / (1 + sqrt(maximum(square_strain + 1, 0)))
             return (k + tau) * (lock * lock) * integral(e / lock, x0) - tau * e * e
 
-        return LawFunctions(pull if tense else pull_untensed, derivatives, parameter_derivatives, energy)
+        def at_length(length, scale, x0, lock):
+            return [scale / length, x0, lock]
+
+        return LawFunctions(pull if tense else pull_untensed, derivatives, parameter_derivatives, energy, at_length)
 
 
 def spring_law(stiffening: LockNumbers | None) -> Law:

@@ -20,8 +20,8 @@ from taichi_msm.model.loads import Schedule, decay, decay_gradient
 from taichi_msm.model.plan import Plan, ProbeSlot
 from taichi_msm.model.sheet import axes, spacing
 from taichi_msm.model.tool_force import probe_force
-from taichi_msm.scene.scene import Scene
-from taichi_msm.terms.base import AREA_SHARE, DY, REST_X, TOP_Y, KernelConfig, Term
+from taichi_msm.terms.base import KernelConfig, Term
+from taichi_msm.terms.points import build_point_functions
 
 # Columns of a slot: force (3), control point (2), falloff, shift and offset.
 FORCE, POINT, FALLOFF, SHIFT, OFFSET, SLOT_COLUMNS = 0, 3, 5, 6, 7, 8
@@ -39,7 +39,7 @@ class ProbeTerm(Term):
     @classmethod
     def from_plan(cls, plan: Plan) -> Self:
         probes = plan.scene.probes
-        by_area = tuple(plan.open_edges and probes[slot.probe].total is not None for slot in plan.slots)
+        by_area = tuple(plan.areas_vary and probes[slot.probe].total is not None for slot in plan.slots)
         return cls(tuple(slot.moves for slot in plan.slots), by_area)
 
     @property
@@ -61,14 +61,14 @@ class ProbeTerm(Term):
 
     def fields(self, plan: Plan) -> NDArray[Any]:
         scene = plan.scene
-        decays = [decay(scene.probes[slot.probe], scene.sheet) for slot in plan.slots if not slot.moves]
+        decays = [decay(scene.probes[slot.probe], plan) for slot in plan.slots if not slot.moves]
         return np.array(decays).reshape(-1, *scene.sheet.points)
 
     def build_forces(self, config: KernelConfig) -> Sequence[Callable[..., Any]]:
         ti = config.ti
         moves, by_area, first = self.moves, self.by_area, config.first_column(ProbeTerm)
         vector, lanes = config.vector, config.lanes
-        first_field = config.first_field(ProbeTerm)
+        first_field, (_, area_share, rest_position) = config.first_field(ProbeTerm), build_point_functions(config)
         stationary = [first_field + moves[:n].count(False) for n in range(len(moves))]
 
         @ti.func
@@ -77,13 +77,13 @@ class ProbeTerm(Term):
                 column = ti.static(first + SLOT_COLUMNS * n)
                 factor = vector(0)
                 if ti.static(moves[n]):
-                    off_x = sheet.by_column[REST_X * sheet.width + entry.b] - now[column + POINT]
-                    off_y = sheet.constants[TOP_Y] - entry.row.i * sheet.constants[DY] - now[column + POINT + 1]
+                    rest = rest_position(sheet, entry.row.i, entry.b)
+                    off_x, off_y = rest[0] - now[column + POINT], rest[1] - now[column + POINT + 1]
                     exponent = now[column + FALLOFF] * ti.sqrt(off_x * off_x + off_y * off_y) + now[column + SHIFT]
                     exponent = ti.max(exponent, now[column + OFFSET])
                     factor = vector([ti.exp(-exponent[lane]) for lane in ti.static(range(lanes))])
                     if ti.static(by_area[n]):
-                        factor *= sheet.by_column[(AREA_SHARE + entry.row.kind) * sheet.width + entry.b]
+                        factor *= area_share(sheet, entry.row.i, entry.row.kind, entry.b)
                 else:
                     factor = sheet.fields[(stationary[n] * sheet.rows + entry.row.i) * sheet.width + entry.b]
                 for c in ti.static(range(3)):
@@ -104,7 +104,7 @@ class ProbeTerm(Term):
     def decay_gradients(self, plan: Plan) -> NDArray[Any]:
         """Differentiate the fields by x and y of the control point [1/m], shape (field_count, 2, rows, cols)."""
         scene = plan.scene
-        gradients = [decay_gradient(scene.probes[slot.probe], scene.sheet) for slot in plan.slots if not slot.moves]
+        gradients = [decay_gradient(scene.probes[slot.probe], plan) for slot in plan.slots if not slot.moves]
         return np.array(gradients).reshape(-1, 2, *scene.sheet.points)
 
     def build_load_adjoint(self, config: KernelConfig, first_gradient: int) -> Callable[..., None]:
@@ -121,6 +121,7 @@ class ProbeTerm(Term):
         ti = config.ti
         moves, by_area, first = self.moves, self.by_area, config.first_column(ProbeTerm)
         vector, lanes, first_field = config.vector, config.lanes, config.first_field(ProbeTerm)
+        _, area_share, rest_position = build_point_functions(config)
         stationary = [moves[:n].count(False) for n in range(len(moves))]
 
         @ti.func
@@ -130,8 +131,8 @@ class ProbeTerm(Term):
                 column = ti.static(first + SLOT_COLUMNS * n)
                 factor, gradient = vector(0), [vector(0), vector(0)]
                 if ti.static(moves[n]):
-                    off_x = sheet.by_column[REST_X * sheet.width + b] - now[column + POINT]
-                    off_y = sheet.constants[TOP_Y] - i * sheet.constants[DY] - now[column + POINT + 1]
+                    rest = rest_position(sheet, i, b)
+                    off_x, off_y = rest[0] - now[column + POINT], rest[1] - now[column + POINT + 1]
                     distance = ti.sqrt(off_x * off_x + off_y * off_y)
                     exponent = now[column + FALLOFF] * distance + now[column + SHIFT]
                     # The derivative is 0 where the force does not depend on the distance, and at the control point.
@@ -140,7 +141,7 @@ class ProbeTerm(Term):
                     exponent = ti.max(exponent, now[column + OFFSET])
                     factor = vector([ti.exp(-exponent[lane]) for lane in ti.static(range(lanes))])
                     if ti.static(by_area[n]):
-                        factor *= sheet.by_column[(AREA_SHARE + entry.row.kind) * sheet.width + b]
+                        factor *= area_share(sheet, i, entry.row.kind, b)
                     gradient[0], gradient[1] = factor * slope * off_x, factor * slope * off_y
                 else:
                     factor = sheet.fields[((first_field + stationary[n]) * sheet.rows + i) * sheet.width + b]
@@ -173,15 +174,16 @@ def max_free_acceleration(plan: Plan) -> float:
     return sum(forces) / plan.material.mass
 
 
-def decay_norm_bound(slot: ProbeSlot, scene: Scene) -> float:
+def decay_norm_bound(slot: ProbeSlot, plan: Plan) -> float:
     """Return an upper bound of the Euclidean norm of a slot's decay factors, over all mass points.
 
     Args:
         slot: slot of a probe; its control point may move.
-        scene: scene of the slot.
+        plan: plan of the slot.
     """
+    scene = plan.scene
     if not slot.moves:
-        return float(np.linalg.norm(decay(scene.probes[slot.probe], scene.sheet)))
+        return float(np.linalg.norm(decay(scene.probes[slot.probe], plan)))
     # The control point is within half a cell's diagonal of some mass point. Four copies of the sheet that meet at this
     # mass point cover the sheet, and their norm is twice that of one copy with the mass point at its corner.
     x, y = axes(scene.sheet)

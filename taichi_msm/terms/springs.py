@@ -20,7 +20,7 @@ for f = 1, and e = S / (3/2 E t).
 # No `from __future__ import annotations` here: Taichi reads the annotations of a kernel.
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any, ClassVar
 
@@ -29,17 +29,19 @@ from numpy.typing import NDArray
 from typing_extensions import Self
 
 from taichi_msm.model.plan import Plan
-from taichi_msm.model.sheet import Material, largest_mean, spacing
+from taichi_msm.model.sheet import Material, Springs, largest_mean, spacing
 from taichi_msm.scene.scene import Scene
 from taichi_msm.scene.sheet import Sheet
-from taichi_msm.terms.base import AREA_SHARE, DX, DY, HAS_LEFT, HAS_RIGHT, KernelConfig, Term
+from taichi_msm.terms.base import AREA_SHARE, DX, DY, HAS_LEFT, HAS_RIGHT, KernelConfig, RowPair, Term
 from taichi_msm.terms.law import LINEAR, Law, law_parameters, make_stiffening, spring_law
+from taichi_msm.terms.points import build_point_functions
 
-# Families of springs.
+# Families of springs with constants of their own, and with fields of their own: the diagonals of a cell differ there.
 ALONG_ROW, ALONG_COLUMN, DIAGONAL = range(3)
+FALLING, RISING, FAMILIES = 2, 3, 4
 
 # Measures: minimum and maximum of (L^2 - L0^2) / L0^2; sum of `LawFunctions.energy` for each family; under tension, sum
-# of |q|^2 / L0^2 for each family.
+# of tau |q|^2 / L0^2 for each family. On a curved sheet the sums are multiplied by L0^2.
 MIN_STRAIN, MAX_STRAIN, STRETCH_SUMS, TENSION_SUMS = 0, 1, 2, 5
 
 # Constants, each for all families in turn: k - tau, tau, parameters of the law.
@@ -59,7 +61,7 @@ class SpringTerm(Term):
     shear: bool  # whether the sheet has springs along diagonals
     open_edges: bool  # whether any mass point at an edge can move; only then are springs beyond the edge masked
     by_area: bool  # whether springs along an open edge are softer, because they belong to one cell
-    mapped: bool  # whether each stiffness is read from an array, with 0 for springs beyond an edge
+    varied: bool  # whether k - tau and tau of every spring are fields, with 0 for springs beyond an edge
     tense: bool  # whether the sheet is under tension at rest
     law: Law = LINEAR  # of the springs
 
@@ -100,7 +102,7 @@ class SpringTerm(Term):
             shear=material.shear > 0,
             open_edges=open_edges,
             by_area=open_edges and material.by_area,
-            mapped=material.factors is not None,
+            varied=material.factors is not None or material.springs is not None,
             tense=material.tension > 0,
             law=spring_law(material.stiffening),
         )
@@ -115,21 +117,25 @@ class SpringTerm(Term):
         #
         # With a map, the mass of each mass point is distributed over its cells in proportion to their stiffness. The
         # bound is then multiplied by the largest mean of the factors around a mass point.
+        if material.springs is not None:
+            return float(_bounds_of(material, material.springs).max())
         largest = 1.0
         if material.factors is not None:
             largest = largest_mean(material.factors) if material.by_area else float(material.factors.max())
         return _unmapped_bound(material) * largest
 
     @classmethod
-    def node_stiffness_bounds(cls, plan: Plan) -> NDArray[Any] | float:
+    def node_stiffness_bounds(cls, material: Material, sheet: Sheet) -> NDArray[Any] | float:
         """Bound the stiffness at each mass point [N/m], shape (rows, cols).
 
         Each cell contributes a quarter of its bound to each corner, so mass points at an edge of tissue have lower
         bounds. In scenes with `springs`, edges are not softer; there the largest factor around the mass point counts.
         """
-        material, factors = plan.material, plan.material.factors
+        if material.springs is not None:
+            return _bounds_of(material, material.springs)
+        factors = material.factors
         if factors is None:
-            factors = np.ones([count - 1 for count in plan.scene.sheet.points])
+            factors = np.ones([count - 1 for count in sheet.points])
         padded = np.pad(factors, 1)
         cells = np.stack([padded[:-1, :-1], padded[:-1, 1:], padded[1:, :-1], padded[1:, 1:]])
         shares = cells.mean(axis=0) if material.by_area else cells.max(axis=0)
@@ -140,61 +146,127 @@ class SpringTerm(Term):
         remainder = 1 - material.tension
         stiffness = material.across * remainder, material.down * remainder, material.shear * remainder
         lengths = dx, dy, math.hypot(dx, dy)
+        if material.springs is not None and material.springs.rest is not None:
+            lengths = 1.0, 1.0, 1.0  # the kernels divide by the length of each spring
         parameters = (value for length in lengths for value in law_parameters(material.stiffening, length))
         return *stiffness, *material.tensions, *parameters
 
+    @property
+    def field_count(self) -> int:
+        return FAMILIES * (1 + self.tense) * self.varied
+
+    def fields(self, plan: Plan) -> NDArray[Any]:
+        """Return k - tau, and under tension tau, of all families [N/m], each spring at its upper left end."""
+        if not self.varied:
+            return super().fields(plan)
+        points = plan.scene.sheet.points
+        springs, fields = assemble_springs(plan.material, points), np.zeros((self.field_count, *points))
+        for family, (k, tau) in enumerate(zip(springs.stiffness, springs.tension, strict=True)):
+            rows, cols = k.shape
+            fields[family, :rows, :cols] = np.maximum(k - tau, 0)
+            if self.tense:
+                fields[FAMILIES + family, :rows, :cols] = tau
+        return fields
+
     def energy(self, sums: NDArray[Any], plan: Plan) -> float:
+        total, springs = sums[STRETCH_SUMS:TENSION_SUMS] + sums[TENSION_SUMS:], plan.material.springs
+        if springs is not None and springs.rest is not None:
+            return float(total.sum())
         dx, dy = spacing(plan.scene.sheet)
-        squares = np.array([dx**2, dy**2, dx**2 + dy**2])
-        return float((sums[STRETCH_SUMS:TENSION_SUMS] + plan.material.tensions * sums[TENSION_SUMS:]) @ squares)
+        return float(total @ (dx**2, dy**2, dx**2 + dy**2))
 
     def _build_parameters(self, config: KernelConfig) -> Callable[..., Any]:
-        """Build the Taichi function parameters_of(sheet, family), the list of the parameters of the law."""
+        """Build the Taichi function parameters_of(sheet, family, length), the list of the parameters of the law."""
         ti, count, first = config.ti, self.law.parameter_count, config.first_constant(SpringTerm) + FIRST_PARAMETER
+        of_length, at_length = config.curved and count > 0, config.compile_law(self.law, tense=self.tense).at_length
 
         @ti.func
-        def parameters_of(sheet: ti.template(), family: ti.template()):
-            return [sheet.constants[first + count * family + n] for n in ti.static(range(count))]
+        def parameters_of(sheet: ti.template(), family: ti.template(), length):
+            parameters = [sheet.constants[first + count * family + n] for n in ti.static(range(count))]
+            if ti.static(of_length):
+                return at_length(length, *parameters)
+            else:  # noqa: RET505  # Taichi would compile the rest as well.
+                return parameters
 
         return parameters_of
 
-    def build_cell_shares(self, config: KernelConfig) -> tuple[Callable[..., Any], Callable[..., Any]]:
-        """Build the Taichi functions row_share(exists, kind) and column_share(sheet, exists, b).
+    def _build_field(self, config: KernelConfig, first: int) -> Callable[..., Any]:
+        """Build the Taichi function that reads a field of a family, see `build_stiffness`; `first` is that of rows."""
+        ti = config.ti
 
-        They return the share of the tension of a spring along a row or a column: `exists`, and with `tense_edges` half
-        of it along an edge, where the spring belongs to one cell instead of two.
+        @ti.func
+        def of_spring(sheet: ti.template(), family: ti.template(), falls, i, b):
+            field = first + family
+            if ti.static(family == DIAGONAL):
+                field = first + ti.select(falls, FALLING, RISING)
+            return sheet.fields[(field * sheet.rows + i) * sheet.width + b]
+
+        return of_spring
+
+    def build_stiffness(self, config: KernelConfig) -> Callable[..., Any]:
+        """Build the Taichi function stiffness(sheet, family, falls, i, kind, b), k - tau of a spring [N/m].
+
+        Entry b of row i is the left or upper end of a spring along a row or column, or the upper left corner of the
+        cell of a diagonal, which falls to the right or rises.
         """
-        ti, real, tense_edges = config.ti, config.real, self.tense_edges
+        ti, real, first = config.ti, config.real, config.first_constant(SpringTerm)
+        varied, by_area, read = self.varied, self.by_area, self._build_field(config, config.first_field(SpringTerm))
 
         @ti.func
-        def row_share(exists, kind):
-            if ti.static(tense_edges):
-                return exists * ti.select(kind == 1, ti.cast(1, real), ti.cast(0.5, real))
-            else:  # noqa: RET505
-                return exists
+        def stiffness(sheet: ti.template(), family: ti.template(), falls, i, kind, b):
+            if ti.static(varied):
+                return read(sheet, family, falls, i, b)
+            elif ti.static(by_area and family == ALONG_ROW):  # noqa: RET505
+                return sheet.constants[first + ALONG_ROW] * ti.select(kind == 1, ti.cast(1, real), ti.cast(0.5, real))
+            elif ti.static(by_area and family == ALONG_COLUMN):
+                return sheet.constants[first + ALONG_COLUMN] * sheet.by_column[(AREA_SHARE + 1) * sheet.width + b]
+            else:
+                return sheet.constants[first + family]
+
+        return stiffness
+
+    def _build_tension(self, config: KernelConfig) -> Callable[..., Any]:
+        """Build the Taichi function tension(sheet, family, falls, i, kind, b, exists), tau of a spring [N/m].
+
+        Along an open edge it is half, as the spring belongs to one cell instead of two.
+        """
+        ti, real, first = config.ti, config.real, config.first_constant(SpringTerm) + FIRST_TENSION
+        varied, edges = self.varied and self.tense, self.tense_edges
+        read = self._build_field(config, config.first_field(SpringTerm) + FAMILIES)
 
         @ti.func
-        def column_share(sheet: ti.template(), exists, b):
-            if ti.static(tense_edges):
-                return exists * sheet.by_column[(AREA_SHARE + 1) * sheet.width + b]
-            else:  # noqa: RET505
-                return exists
+        def tension(sheet: ti.template(), family: ti.template(), falls, i, kind, b, exists):
+            if ti.static(varied):
+                return read(sheet, family, falls, i, b) * exists
+            elif ti.static(edges and family == ALONG_ROW):  # noqa: RET505
+                share = ti.select(kind == 1, ti.cast(1, real), ti.cast(0.5, real))
+                return sheet.constants[first + ALONG_ROW] * (exists * share)
+            elif ti.static(edges and family == ALONG_COLUMN):
+                return sheet.constants[first + ALONG_COLUMN] * (
+                    exists * sheet.by_column[(AREA_SHARE + 1) * sheet.width + b]
+                )
+            elif ti.static(edges):
+                return sheet.constants[first + DIAGONAL] * exists
+            else:
+                return sheet.constants[first + family]
 
-        return row_share, column_share
+        return tension
 
     def build_spring_forces(self, config: KernelConfig) -> tuple[Callable[..., Any], Callable[..., Any]]:
         """Build the Taichi functions for the force of a mass point with displacement `u` on a neighbour [N].
 
-        `exists` is 1, 0 for a spring beyond an edge, or a share from `build_cell_shares`.
+        `entry` is that of the neighbour in u, b that of the mass point in its row, and `exists` is 1, or 0 for a spring
+        beyond an edge.
 
         Returns:
-            force_on_right(sheet, right, u, k, exists) for the right neighbour, entry `right` of u;
-            force_on_other(sheet, entry, right, u, up, length, k, exists) for a neighbour in another row, entry `entry`
-            of u, `up` [m] above and `right` columns to the right.
+            force_on_right(sheet, pair, entry, b, u, exists) for the right neighbour;
+            force_on_other(sheet, pair, entry, right, b, u, exists) for a neighbour in the other row of a `RowPair`,
+            `right` columns to the right.
         """
-        ti, vector, tense = config.ti, config.vector, self.tense
+        ti, vector, tense, curved = config.ti, config.vector, self.tense, config.curved
         open_edges, tense_edges = self.open_edges, self.tense_edges
-        first_tension, parameters_of = config.first_constant(SpringTerm) + FIRST_TENSION, self._build_parameters(config)
+        stiffness_of, tension_of = self.build_stiffness(config), self._build_tension(config)
+        parameters_of, rest_position = self._build_parameters(config), build_point_functions(config).rest_position
         pull = config.compile_law(self.law, tense=tense).pull
 
         @ti.func
@@ -208,21 +280,14 @@ class SpringTerm(Term):
                 return k
 
         @ti.func
-        def tension_of(sheet: ti.template(), family: ti.template(), exists):
-            """Return the tension tau of a spring [N/m]."""
-            if ti.static(tense_edges):
-                return sheet.constants[first_tension + family] * exists
-            else:  # noqa: RET505
-                return sheet.constants[first_tension + family]
-
-        @ti.func
         def force(
-            sheet: ti.template(), family: ti.template(), k, exists, square_difference, square, length,
+            sheet: ti.template(), family: ti.template(), falls, i, kind, b, exists, square_difference, square, length,
             edge: ti.template(), q: ti.template(),
         ):  # fmt: skip
             """Return the force of the spring `edge`, the vector to the mass point that exerts it."""
-            tension, parameters = tension_of(sheet, family, exists), parameters_of(sheet, family)
-            per_length = pull(masked(k, exists), tension, square_difference, square, length, *parameters)
+            k = masked(stiffness_of(sheet, family, falls, i, kind, b), exists)
+            tension = tension_of(sheet, family, falls, i, kind, b, exists)
+            per_length = pull(k, tension, square_difference, square, length, *parameters_of(sheet, family, length))
             total = [per_length * edge[c] for c in ti.static(range(3))]
             if ti.static(tense):
                 for c in ti.static(range(3)):
@@ -230,69 +295,71 @@ class SpringTerm(Term):
             return total
 
         @ti.func
-        def force_on_right(sheet: ti.template(), right, u: ti.template(), k, exists):
-            dx = sheet.constants[DX]
-            x, y, z = u[0] - sheet.u[0][right], u[1] - sheet.u[1][right], u[2] - sheet.u[2][right]
-            edge_x = x - dx
-            rest = y * y + z * z
-            square_difference = x * (edge_x - dx) + rest
-            square = edge_x * edge_x + (rest + MIN_SQUARED_LENGTH)
-            return force(sheet, ALONG_ROW, k, exists, square_difference, square, dx, [edge_x, y, z], [x, y, z])
+        def curved_force(
+            sheet: ti.template(), family: ti.template(), falls, i, kind, b, exists, q: ti.template(), o: ti.template()
+        ):
+            """Return the force of a spring with the vector o at rest to the mass point that exerts it."""
+            edge = [q[c] + o[c] for c in ti.static(range(3))]
+            square_difference, square, square_at_rest = (
+                vector(0),
+                vector(MIN_SQUARED_LENGTH),
+                vector(MIN_SQUARED_LENGTH),
+            )
+            for c in ti.static(range(3)):
+                square_difference += q[c] * (edge[c] + o[c])
+                square += edge[c] * edge[c]
+                square_at_rest += o[c] * o[c]
+            length = ti.sqrt(square_at_rest)
+            return force(sheet, family, falls, i, kind, b, exists, square_difference, square, length, edge, q)
 
         @ti.func
-        def force_on_other(sheet: ti.template(), entry, right: ti.template(), u: ti.template(), up, length, k, exists):
+        def force_on_right(sheet: ti.template(), pair: ti.template(), entry, b, u: ti.template(), exists):
             x, y, z = u[0] - sheet.u[0][entry], u[1] - sheet.u[1][entry], u[2] - sheet.u[2][entry]
-            edge_x = x
-            edge_y = y - up
-            rest = z * z
-            square_difference = x * x + (y * (edge_y - up) + rest)
-            if ti.static(right != 0):
-                edge_x = x - right * sheet.constants[DX]
-                square_difference = x * (edge_x - right * sheet.constants[DX]) + (y * (edge_y - up) + rest)
-            square = edge_x * edge_x + edge_y * edge_y + (rest + MIN_SQUARED_LENGTH)
+            i, kind = pair.i, pair.kind
+            if ti.static(curved):
+                at, end = rest_position(sheet, i, b), rest_position(sheet, i, b + 1)
+                o = [at[c] - end[c] for c in ti.static(range(3))]
+                return curved_force(sheet, ALONG_ROW, True, i, kind, b, exists, [x, y, z], o)
+            else:  # noqa: RET505
+                dx = sheet.constants[DX]
+                edge_x = x - dx
+                rest = y * y + z * z
+                square_difference = x * (edge_x - dx) + rest
+                square = edge_x * edge_x + (rest + MIN_SQUARED_LENGTH)
+                return force(
+                    sheet, ALONG_ROW, True, i, kind, b, exists, square_difference, square, dx, [edge_x, y, z], [x, y, z]
+                )
+
+        @ti.func
+        def force_on_other(
+            sheet: ti.template(), pair: ti.template(), entry, right: ti.template(), b, u: ti.template(), exists
+        ):
+            x, y, z = u[0] - sheet.u[0][entry], u[1] - sheet.u[1][entry], u[2] - sheet.u[2][entry]
             family = ti.static(DIAGONAL if right else ALONG_COLUMN)
-            return force(sheet, family, k, exists, square_difference, square, length, [edge_x, edge_y, z], [x, y, z])
+            falls = (pair.up < 0) == ti.static(right > 0)
+            # The upper left corner of the spring's cell.
+            i, left = pair.upper, b + ti.static(min(right, 0))
+            if ti.static(curved):
+                at, end = rest_position(sheet, pair.i, b), rest_position(sheet, pair.other, b + right)
+                o = [at[c] - end[c] for c in ti.static(range(3))]
+                return curved_force(sheet, family, falls, i, 1, left, exists, [x, y, z], o)
+            else:  # noqa: RET505
+                up, length = pair.up, ti.abs(pair.up)
+                edge_x = x
+                edge_y = y - up
+                rest = z * z
+                square_difference = x * x + (y * (edge_y - up) + rest)
+                if ti.static(right != 0):
+                    length = pair.diagonal
+                    edge_x = x - right * sheet.constants[DX]
+                    square_difference = x * (edge_x - right * sheet.constants[DX]) + (y * (edge_y - up) + rest)
+                square = edge_x * edge_x + edge_y * edge_y + (rest + MIN_SQUARED_LENGTH)
+                edge = [edge_x, edge_y, z]
+                return force(
+                    sheet, family, falls, i, 1, left, exists, square_difference, square, length, edge, [x, y, z]
+                )
 
         return force_on_right, force_on_other
-
-    def build_stiffness(self, config: KernelConfig) -> tuple[Callable[..., Any], ...]:
-        """Build the Taichi functions for the stiffness k - tau of a spring along a row, a column and diagonals [N/m].
-
-        Returns:
-            row_stiffness(sheet, i, kind, b), column_stiffness(sheet, lower, b) and diagonal_stiffness(sheet, lower, b).
-        """
-        ti, real, first = config.ti, config.real, config.first_constant(SpringTerm)
-        mapped, by_area = self.mapped, self.by_area
-
-        @ti.func
-        def row_stiffness(sheet: ti.template(), i, kind, b):
-            """Return the stiffness of the spring right of entry b of row i; along an edge of tissue it is half."""
-            if ti.static(mapped):
-                return sheet.stiffness[i * sheet.width + b]
-            elif ti.static(by_area):  # noqa: RET505  # Taichi would compile the rest as well.
-                return sheet.constants[first + ALONG_ROW] * ti.select(kind == 1, ti.cast(1, real), ti.cast(0.5, real))
-            else:
-                return sheet.constants[first + ALONG_ROW]
-
-        @ti.func
-        def column_stiffness(sheet: ti.template(), lower, b):
-            """Return the stiffness of the spring between entry b of row `lower` and the row above."""
-            if ti.static(mapped):
-                return sheet.stiffness[(sheet.rows + lower) * sheet.width + b]
-            elif ti.static(by_area):  # noqa: RET505
-                return sheet.constants[first + ALONG_COLUMN] * sheet.by_column[(AREA_SHARE + 1) * sheet.width + b]
-            else:
-                return sheet.constants[first + ALONG_COLUMN]
-
-        @ti.func
-        def diagonal_stiffness(sheet: ti.template(), lower, b):
-            """Return the stiffness of the diagonals of the cell right of entry b, above row `lower`."""
-            if ti.static(mapped):
-                return sheet.stiffness[(2 * sheet.rows + 1 + lower) * sheet.width + b]
-            else:  # noqa: RET505
-                return sheet.constants[first + DIAGONAL]
-
-        return row_stiffness, column_stiffness, diagonal_stiffness
 
     def build_spring_tangent(self, config: KernelConfig) -> Callable[..., Any]:
         """Build the Taichi function that differentiates the force of a mass point P on its neighbour Q.
@@ -304,7 +371,8 @@ class SpringTerm(Term):
         The map from p to this change is symmetric.
         """
         ti, tense, count = config.ti, self.tense, self.law.parameter_count
-        _, derivatives, parameter_derivatives, _ = config.compile_law(self.law, tense=tense)
+        law = config.compile_law(self.law, tense=tense)
+        derivatives, parameter_derivatives = law.derivatives, law.parameter_derivatives
         first_tension, parameters_of = config.first_constant(SpringTerm) + FIRST_TENSION, self._build_parameters(config)
 
         @ti.func
@@ -319,7 +387,7 @@ class SpringTerm(Term):
             square = edge[0] * edge[0] + edge[1] * edge[1] + (edge[2] * edge[2] + MIN_SQUARED_LENGTH)
             square_difference = q[0] * (edge[0] + x0) + (q[1] * (edge[1] + y0) + q[2] * q[2])
             along = edge[0] * p[0] + edge[1] * p[1] + edge[2] * p[2]
-            tension, parameters = sheet.constants[first_tension + family], parameters_of(sheet, family)
+            tension, parameters = sheet.constants[first_tension + family], parameters_of(sheet, family, length)
             isotropic, axial, by_k, by_tau = derivatives(
                 k, tension, square_difference, square, length, along, *parameters
             )
@@ -340,12 +408,10 @@ class SpringTerm(Term):
         ti = config.ti
         structural, shear, vector = self.structural, self.shear, config.vector
         force_on_right, force_on_other = self.build_spring_forces(config)
-        row_stiffness, column_stiffness, diagonal_stiffness = self.build_stiffness(config)
-        row_share, column_share = self.build_cell_shares(config)
 
         @ti.func
-        def larger(largest, force: ti.template()):
-            return ti.max(largest, force[0] * force[0] + force[1] * force[1] + force[2] * force[2])
+        def larger(largest, force: ti.template(), exists):
+            return ti.max(largest, (force[0] * force[0] + force[1] * force[1] + force[2] * force[2]) * exists)
 
         @ti.func
         def max_force(sheet: ti.template(), entry: ti.template()):
@@ -356,20 +422,18 @@ class SpringTerm(Term):
             has_left = sheet.by_column[HAS_LEFT * sheet.width + b]
             has_right = sheet.by_column[HAS_RIGHT * sheet.width + b]
             dx, dy = sheet.constants[DX], sheet.constants[DY]
-            at, below, lower = row.i * sheet.width + b, (row.i + 1) * sheet.width + b, row.i + 1
+            at, below = row.i * sheet.width + b, (row.i + 1) * sheet.width + b
+            pair = ti.static(RowPair(row.i, row.kind, row.i + 1, row.i, 0 - dy, ti.sqrt(dx * dx + dy * dy)))
             if ti.static(structural):
-                k, share = vector(0) + row_stiffness(sheet, row.i, row.kind, b), row_share(has_right, row.kind)
-                largest = larger(largest, force_on_right(sheet, at + 1, u, k * has_right, share))
-            if lower < sheet.rows:
+                largest = larger(largest, force_on_right(sheet, pair, at + 1, b, u, has_right), has_right)
+            if row.i + 1 < sheet.rows:
                 if ti.static(structural):
-                    k, share = vector(0) + column_stiffness(sheet, lower, b), column_share(sheet, vector(1), b)
-                    largest = larger(largest, force_on_other(sheet, below, 0, u, 0 - dy, dy, k, share))
+                    force = force_on_other(sheet, pair, below, 0, b, u, vector(1))
+                    largest = larger(largest, force, vector(1))
                 if ti.static(shear):
-                    diagonal = ti.sqrt(dx * dx + dy * dy)
                     for right, exists in ti.static(((-1, has_left), (1, has_right))):
-                        k = vector(0) + diagonal_stiffness(sheet, lower, b + ti.static(min(right, 0)))
-                        force = force_on_other(sheet, below + right, right, u, 0 - dy, diagonal, k * exists, exists)
-                        largest = larger(largest, force)
+                        force = force_on_other(sheet, pair, below + right, right, b, u, exists)
+                        largest = larger(largest, force, exists)
             return largest
 
         return max_force
@@ -377,61 +441,64 @@ class SpringTerm(Term):
     def build_measures(self, config: KernelConfig) -> Sequence[Callable[..., None]]:
         ti = config.ti
         tense, open_edges, vector, first = self.tense, self.open_edges, config.vector, config.first_measure(SpringTerm)
-        row_stiffness, column_stiffness, diagonal_stiffness = self.build_stiffness(config)
-        row_share, column_share = self.build_cell_shares(config)
-        tense_edges = self.tense_edges
-        first_tension, parameters_of = config.first_constant(SpringTerm) + FIRST_TENSION, self._build_parameters(config)
-        energy = config.compile_law(self.law, tense=self.tense).energy
+        varied, curved = self.varied, config.curved
+        stiffness_of, tension_of = self.build_stiffness(config), self._build_tension(config)
+        parameters_of, rest_position = self._build_parameters(config), build_point_functions(config).rest_position
+        energy = config.compile_law(self.law, tense=tense).energy
         # For each family its index, and the rows down and columns right from one end of a spring to the other.
         structural = ((ALONG_ROW, 0, (1,)), (ALONG_COLUMN, 1, (0,))) if self.structural else ()
         families = structural + (((DIAGONAL, 1, (-1, 1)),) if self.shear else ())
 
         @ti.func
-        def strains(sheet: ti.template(), p, q, b, right: ti.template(), x0, y0):
-            """Return (L^2 - L0^2) / L0^2 and |q|^2 / L0^2 of the spring from entry b of row p to b + right of row q."""
+        def rest_vector(sheet: ti.template(), i, b, down: ti.template(), right: ti.template()):
+            """Return the vector at rest from entry b of row i to the other end of a spring."""
+            if ti.static(curved):
+                start, end = rest_position(sheet, i, b), rest_position(sheet, i + down, b + right)
+                return [end[c] - start[c] for c in ti.static(range(3))]
+            else:  # noqa: RET505
+                return [right * sheet.constants[DX], -down * sheet.constants[DY]]
+
+        @ti.func
+        def strains(sheet: ti.template(), p, q, b, right: ti.template(), o: ti.template()):
+            """Return (L^2 - L0^2) / L0^2, |q|^2 / L0^2 and L0^2 of the spring from entry b of row p to one of row q."""
             start, end = p * sheet.width + b, q * sheet.width + b + right
             x = sheet.u[0][end] - sheet.u[0][start]
             y = sheet.u[1][end] - sheet.u[1][start]
             z = sheet.u[2][end] - sheet.u[2][start]
-            square = x0 * x0 + y0 * y0
-            square_strain = (x * (x + 2 * x0) + (y * (y + 2 * y0) + z * z)) / square
-            square_motion = (x * x + y * y + z * z) / square
-            # Springs beyond the edge do not exist.
-            if ti.static(open_edges and right != 0):
-                side = ti.static(HAS_LEFT if right < 0 else HAS_RIGHT)
-                square_strain = ti.select(sheet.by_column[side * sheet.width + b] > 0, square_strain, vector(0))
-            return square_strain, square_motion
+            square, beyond = o[0] * o[0] + o[1] * o[1], z * z
+            if ti.static(curved):
+                square, beyond = square + (o[2] * o[2] + MIN_SQUARED_LENGTH), z * (z + 2 * o[2])
+            square_strain = (x * (x + 2 * o[0]) + (y * (y + 2 * o[1]) + beyond)) / square
+            return square_strain, (x * x + y * y + z * z) / square, square
 
         @ti.func
         def measure(measures: ti.template(), sheet: ti.template(), p, i, kind, b):
-            dx, dy = sheet.constants[DX], sheet.constants[DY]
             for family, down, rights in ti.static(families):
                 if i + down < sheet.rows:
                     stretch_sum, tension_sum = vector(0), vector(0)
-                    tension, parameters = sheet.constants[first_tension + family], parameters_of(sheet, family)
                     for right in ti.static(rights):
-                        k = vector(0)
-                        if ti.static(family == ALONG_ROW):
-                            k += row_stiffness(sheet, i, kind, b)
-                        elif ti.static(family == ALONG_COLUMN):
-                            k += column_stiffness(sheet, i + 1, b)
-                        else:
-                            k += diagonal_stiffness(sheet, i + 1, b + ti.static(min(right, 0)))
-                        strain, motion = strains(sheet, p, p + down, b, right, right * dx, -down * dy)
+                        exists, left, falls = vector(1), b + ti.static(min(right, 0)), ti.static(right > 0)
+                        if ti.static(open_edges and right != 0):
+                            # Springs beyond the edge do not exist.
+                            exists = sheet.by_column[ti.static(HAS_LEFT if right < 0 else HAS_RIGHT) * sheet.width + b]
+                        k = vector(0) + stiffness_of(sheet, family, falls, i, kind, left)
+                        tension = vector(0) + tension_of(sheet, family, falls, i, kind, left, exists)
+                        strain, motion, square = strains(
+                            sheet, p, p + down, b, right, rest_vector(sheet, i, b, down, right)
+                        )
+                        if ti.static(varied):
+                            exists = ti.select(k + tension > 0, exists, vector(0))
+                        if ti.static(varied or open_edges):
+                            strain = ti.select(exists > 0, strain, vector(0))
                         measures[first + MIN_STRAIN] = ti.min(measures[first + MIN_STRAIN], strain)
                         measures[first + MAX_STRAIN] = ti.max(measures[first + MAX_STRAIN], strain)
-                        stretch_sum += energy(k, tension, strain, *parameters)
-                        if ti.static(tense_edges):
-                            share = vector(1)
-                            if ti.static(right != 0):
-                                share = sheet.by_column[
-                                    ti.static(HAS_LEFT if right < 0 else HAS_RIGHT) * sheet.width + b
-                                ]
-                            if ti.static(family == ALONG_ROW):
-                                share = row_share(share, kind)
-                            if ti.static(family == ALONG_COLUMN):
-                                share = column_share(sheet, share, b)
-                            motion = ti.select(share > 0, motion, vector(0)) * share
+                        parameters = parameters_of(sheet, family, ti.sqrt(square))
+                        stretch = energy(k, tension, strain, *parameters)
+                        if ti.static(tense):
+                            motion = ti.select(exists > 0, motion, vector(0)) * tension
+                        if ti.static(curved):
+                            stretch, motion = stretch * square, motion * square
+                        stretch_sum += stretch
                         tension_sum += motion
                     measures[first + STRETCH_SUMS + family] += stretch_sum
                     if ti.static(tense):
@@ -439,26 +506,44 @@ class SpringTerm(Term):
 
         return (measure,)
 
-    def stiffness_array(self, plan: Plan) -> NDArray[Any] | None:
-        """Return the kernels' array of stiffnesses k - tau [N/m], shape (3 rows + 2, cols); None without a map.
-
-        From top to bottom: springs along rows, shape (rows, cols); along columns and along diagonals, each of shape
-        (rows + 1, cols), with a first and last row of 0. Springs beyond the last column are 0 as well.
-        """
-        material = plan.material
-        if material.factors is None:
-            return None
-        pads = ((0, 0), (0, 1)), ((1, 1), (0, 0)), ((1, 1), (0, 1))
-        unmapped = spring_stiffness(material, np.ones_like(material.factors))
-        families = zip(spring_stiffness(material, material.factors), unmapped, pads, strict=True)
-        return np.concatenate([np.pad(np.maximum(k - k1 * material.tension, 0), pad) for k, k1, pad in families])
-
 
 def _unmapped_bound(material: Material) -> float:
     """Return `SpringTerm.stiffness_bound` for factors of 1 [N/m]."""
     across, down, shear = material.across, material.down, material.shear
     steepest = 1.0 if material.stiffening is None else material.stiffening.factor
     return steepest * 4 * max(across + down, across + 2 * shear, down + 2 * shear)
+
+
+def _bounds_of(material: Material, springs: Springs) -> NDArray[Any]:
+    """Return twice the sum of k at each mass point: the energy k |q|^2 / 2 of a spring is at most k (u_P^2 + u_Q^2)."""
+    bounds = np.zeros(np.add(springs.stiffness[ALONG_ROW].shape, (0, 1)))
+    for k, (start, end) in zip(springs.stiffness, spring_ends(bounds.shape), strict=True):
+        bounds[start] += 2 * k
+        bounds[end] += 2 * k
+    return bounds * (1.0 if material.stiffening is None else material.stiffening.factor)
+
+
+Window = tuple[slice, slice]
+
+
+def spring_ends(points: tuple[int, ...]) -> Iterator[tuple[Window, Window]]:
+    """Yield the slices of the mass points at the upper or left and at the other end of the springs of each family."""
+    rows, cols = points
+    for down, right in ((0, 1), (1, 0), (1, 1), (1, -1)):
+        start = slice(0, rows - down), slice(max(0, -right), cols - max(0, right))
+        yield start, (slice(down, rows), slice(max(0, right), cols - max(0, -right)))
+
+
+def assemble_springs(material: Material, points: tuple[int, int]) -> Springs:
+    """Return the springs of a sheet of rows and columns of mass points as arrays."""
+    if material.springs is not None:
+        return material.springs
+    unmapped = np.ones([count - 1 for count in points])
+    factors = unmapped if material.factors is None else material.factors
+    along_rows, along_columns, diagonals = spring_stiffness(material, factors)
+    # The tension at rest does not depend on the map.
+    tensions = [k * material.tension for k in spring_stiffness(material, unmapped)]
+    return Springs((along_rows, along_columns, diagonals, diagonals), (*tensions, tensions[DIAGONAL]), rest=None)
 
 
 def spring_stiffness(material: Material, factors: NDArray[Any]) -> tuple[NDArray[Any], NDArray[Any], NDArray[Any]]:

@@ -102,7 +102,7 @@ def test_terms_of_random_tissues(image: str, device: Device) -> None:
         assert {config.get(kind) is None for config in configs} == {False, True}, kind
     assert {term.mapped for config in configs if (term := config.get(FoundationTerm))} == {False, True}
     springs, probes = ([config.require(kind) for config in configs] for kind in (SpringTerm, ProbeTerm))
-    for flag in ("mapped", "tense", "open_edges", "by_area"):
+    for flag in ("varied", "tense", "open_edges", "by_area"):
         assert {getattr(term, flag) for term in springs} == {False, True}, flag
     for flag in ("moves", "by_area"):
         assert {value for term in probes for value in getattr(term, flag)} == {False, True}, flag
