@@ -138,6 +138,11 @@ class Material:
     shares: Array | None = None
 
     @property
+    def is_tense(self) -> bool:
+        """Whether the sheet is under tension at rest."""
+        return self.tension > 0 or (self.springs is not None and any(tau.any() for tau in self.springs.tension))
+
+    @property
     def tensions(self) -> tuple[float, float, float]:
         """Tension per length, tau, of springs along rows, along columns and along diagonals [N/m]."""
         return self.across * self.tension, self.down * self.tension, self.shear * self.tension

@@ -103,7 +103,7 @@ class SpringTerm(Term):
             open_edges=open_edges,
             by_area=open_edges and material.by_area,
             varied=material.factors is not None or material.springs is not None,
-            tense=material.tension > 0,
+            tense=material.is_tense,
             law=spring_law(material.stiffening),
         )
 

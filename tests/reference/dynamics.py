@@ -176,7 +176,7 @@ def energy(scene: Scene, displacement: Array) -> float:
     return total
 
 
-def surgical_force(scene: Scene, loads: Schedule, n: int) -> Array:
+def surgical_force(scene: Scene, loads: Schedule, n: int, assembled: Sheet | None = None) -> Array:
     """Return the sum of the forces of probes [N], shape (rows, cols, 3).
 
     Of each, (percent / 100) force exp(-falloff d - offset) (eq. 5), or its total shared by exp(-falloff d).
@@ -185,6 +185,7 @@ def surgical_force(scene: Scene, loads: Schedule, n: int) -> Array:
         scene: scene with force-controlled tools.
         loads: schedule of loads and control points, a row for every step or time.
         n: row of the schedule.
+        assembled: another sheet than the scene's.
     """
     rest = rest_positions(scene.sheet)
     force = np.zeros_like(rest)
@@ -195,8 +196,7 @@ def surgical_force(scene: Scene, loads: Schedule, n: int) -> Array:
         if probe.total is None:
             decay *= np.exp(-probe.offset)
         else:
-            decay[[0, -1]] /= 2
-            decay[:, [0, -1]] /= 2
+            decay *= (assembled or sheet(scene)).share
         force += decay[..., None] * loads.strength[n, index]
     return force
 
@@ -215,7 +215,9 @@ def force(scene: Scene, displacement: Array, loads: Schedule, n: int, assembled:
     springs = elastic_force(scene, displacement, assembled) + bending_force(scene, displacement, assembled)
     # In this order small sheets stay within the roundings of their steps.
     return (
-        springs + surgical_force(scene, loads, n) + loads.active[n] * foundation_force(scene, displacement, assembled)
+        springs
+        + surgical_force(scene, loads, n, assembled)
+        + loads.active[n] * foundation_force(scene, displacement, assembled)
     )
 
 
@@ -314,7 +316,7 @@ def steps(plan: Plan, assembled: Sheet | None = None) -> Iterator[tuple[Array, C
         if scene.tissue is None or not scene.tissue.relaxation:
             return np.asarray(force(scene, u, loads, n, assembled) / m)
         elastic = internal_force(scene, u, loads, n, assembled)
-        return np.asarray((relaxation.step(elastic) + surgical_force(scene, loads, n)) / m)
+        return np.asarray((relaxation.step(elastic) + surgical_force(scene, loads, n, assembled)) / m)
 
     previous = np.zeros((*scene.sheet.points, 3))
     yield previous, contact

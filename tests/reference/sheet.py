@@ -24,8 +24,8 @@ class Springs(NamedTuple):
     # windows of the mass points at their ends; `end` is down or to the right of `start`
     start: Window
     end: Window
-    offset: Array  # vector from start to end at rest [m], x right, y up, z; shape (3,)
-    length: float  # at rest [m]
+    offset: Array  # vector from start to end at rest [m], x right, y up, z; shape (3,) or (..., 3)
+    length: Any  # at rest [m], a number or the shape of the window `start`
     stiffness: Array  # k of each [N/m], shape of the window `start`
     unstretched: Array  # length without force [m], same shape; `length`, unless the sheet is under tension
 
@@ -38,6 +38,7 @@ class Sheet(NamedTuple):
     drag: Array  # C of every point [N s/m], shape (rows, cols)
     virtual: Array  # K of every point [N/m], shape (rows, cols)
     bending: Any  # D dx dy [N m3]
+    share: Array  # area of every point as a share of a cell's, shape (rows, cols)
 
 
 # Rows and columns from the start of a spring to its end.
@@ -91,8 +92,10 @@ def sheet(scene: Scene) -> Sheet:
         TO_LEFT: shear * factor,
     }
     every = np.ones((rows, cols))
+    share = _rows_of(_columns_of(cells)) / 4
     springs = tuple(_springs(scene, ahead, k, 0 * k) for ahead, k in stiffness.items())
-    return Sheet(springs, (scene.sheet.mass or 0.0) * every, scene.damping * every, scene.springs.virtual * every, 0.0)
+    mass, virtual = (scene.sheet.mass or 0.0) * every, scene.springs.virtual * every
+    return Sheet(springs, mass, scene.damping * every, virtual, 0.0, share)
 
 
 def _of_tissue(scene: Scene, tissue: Tissue) -> Sheet:
@@ -114,7 +117,7 @@ def _of_tissue(scene: Scene, tissue: Tissue) -> Sheet:
     plate = tissue.young * tissue.thickness**3 / 12 / (1 - 1 / 9)
     bending = plate if tissue.bending == "plate" else tissue.bending
     virtual = tissue.foundation_stiffness * dx * dy / 4 * quarters * _foundation_factors(scene)
-    return Sheet(springs, mass, tissue.damping * mass, virtual, bending * dx * dy)
+    return Sheet(springs, mass, tissue.damping * mass, virtual, bending * dx * dy, quarters / 4)
 
 
 def _rows_of(cells: Array) -> Array:
