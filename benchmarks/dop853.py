@@ -32,7 +32,7 @@ def integrate(rtol: float, largest: float = 0.03) -> Array:
     plan = make_plan(load_scene(ROOT / "scenes" / "figure-3.yaml", ["output=[]"]))
     scene, shape = plan.scene, (*plan.scene.sheet.points, 3)
     assembled, free = reference.sheet(scene), ~plan.fixed[..., None]
-    share = decay(scene.probes[0], scene.sheet)[..., None]
+    share = decay(scene.probes[0], plan)[..., None]
     frames = np.arange(1, plan.grid.frames + 1) / plan.grid.frames_per_second
     state, displacements = np.zeros((2, *shape)).ravel(), []
     # Intervals between keyframes, where loads are smooth.

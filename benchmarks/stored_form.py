@@ -54,7 +54,7 @@ def displacements(plan: Plan, real: type[np.floating[Any]], form: str) -> Array:
     rest64 = rest_positions(scene.sheet)
     rest = rest64.astype(real)
     moves = ~plan.fixed[..., None]
-    share = [decay(probe, scene.sheet).astype(real)[..., None] for probe in scene.probes]
+    share = [decay(probe, plan).astype(real)[..., None] for probe in scene.probes]
     loads: Schedule = average_loads(plan, 0, grid.steps)
     now = rest.copy() if form == "positions" else np.zeros_like(rest)
     # The previous state, or the difference from it.

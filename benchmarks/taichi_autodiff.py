@@ -24,7 +24,7 @@ class Differentiated:
         self._u = u = ti.Vector.field(3, ti.f64, shape=(steps + 1, n, n), needs_grad=True)
         self._loss = loss = ti.field(ti.f64, shape=(), needs_grad=True)
         load = ti.Vector.field(3, ti.f64, shape=(n, n))
-        load.from_numpy(decay(problem.scene.probes[0], problem.scene.sheet)[..., None] * np.array(FORCE))
+        load.from_numpy(decay(problem.scene.probes[0], problem.plan)[..., None] * np.array(FORCE))
         factors.fill(1)
         dx, diagonal = CELL, CELL * 2**0.5
         k_across, k_down, k_shear, virtual = material.across, material.down, material.shear, material.virtual

@@ -92,7 +92,7 @@ class Problem:
     @cached_property
     def load(self) -> Array:
         """Force on each point, constant in time [N], shape (3, n, n)."""
-        share = decay(self.scene.probes[0], self.scene.sheet)
+        share = decay(self.scene.probes[0], self.plan)
         return np.array(FORCE, np.float32)[:, None, None] * share.astype(np.float32)
 
     @property

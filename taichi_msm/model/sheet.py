@@ -9,7 +9,7 @@ coefficients (see `terms`).
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
@@ -108,8 +108,8 @@ class Springs(NamedTuple):
     cells, first those that fall to the right, then those that rise, (rows - 1, cols - 1) each.
     """
 
-    stiffness: tuple[Array, Array, Array, Array]  # k of every spring [N/m]; 0 where there is none
-    tension: tuple[Array, Array, Array, Array]  # tau, tension at rest per length [N/m]; in equilibrium
+    stiffness: Sequence[Array]  # k of every spring [N/m]; 0 where there is none
+    tension: Sequence[Array]  # tau, tension at rest per length [N/m]; in equilibrium
     rest: Array | None  # rest positions, shape (rows, cols, 3) [m]; None for a flat rectangle
 
 

@@ -44,7 +44,7 @@ def _build_sum(config: KernelConfig) -> Callable[..., None]:
     @ti.kernel
     def add_up(
         rows: ti.i32, cols: ti.i32, clear: ti.i32,
-        by_column: vectors, fields: vectors, sums: ti.types.ndarray(dtype=ti.f64, ndim=2),
+        by_column: vectors, fields_of: vectors, sums: ti.types.ndarray(dtype=ti.f64, ndim=2),
     ):  # fmt: skip
         """Sum the corrections in every row from left to right.
 
@@ -53,9 +53,10 @@ def _build_sum(config: KernelConfig) -> Callable[..., None]:
             cols: number of columns of the sheet.
             clear: whether to set the corrections to 0 afterwards.
             by_column: as in `SheetArrays`.
-            fields: as in `SheetArrays`.
+            fields_of: `SheetArrays.fields`.
             sums: output [m], shape (tools x 3, rows).
         """
+        fields = ti.static(fields_of)
         ti.loop_config(serialize=serial)
         for i in range(rows):
             strip, kind = (cols + lanes - 1) // lanes, ti.select(i == rows - 1, 2, ti.select(i == 0, 0, 1))

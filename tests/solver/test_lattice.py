@@ -78,7 +78,7 @@ def random_springs(plan: Plan, *, tense: bool = False, curved: bool = False) -> 
     if rest is not None:
         rest[..., 2] += 8 * rest[..., 0] ** 2 - 5 * rest[..., 1] ** 2
     tension = [k * (0.1 * tense) for k in stiffness]
-    return Springs(tuple(stiffness), tuple(tension), rest)  # type: ignore[arg-type]
+    return Springs(tuple(stiffness), tuple(tension), rest)
 
 
 def points() -> dict[str, Any]:
