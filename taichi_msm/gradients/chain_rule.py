@@ -18,6 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import BaseModel
 
+from taichi_msm.laws import law_of
 from taichi_msm.model.loads import Schedule
 from taichi_msm.model.plan import Plan, ProbeSegment
 from taichi_msm.model.tool_force import control_points
@@ -43,8 +44,8 @@ class SheetGradient:
     tensions: Array  # tau of springs along rows, along columns and along diagonals at constant k - tau, shape (3,)
     foundation: Array  # log K, the foundation stiffness of every mass point, shape (rows, cols)
     bending: float  # logarithm of the bending stiffness
-    stiffening: Array  # log(lock) and factor of the springs, shape (2,)
-    foundation_stiffening: Array  # log(lock) and factor of the foundation, shape (2,)
+    stiffening: Array  # log m and shape of the law of springs, () without a law
+    foundation_stiffening: Array  # log m and shape of the law of the foundation
     keep: float = 0.0  # factor `keep` of the steps
     gain: float = 0.0  # logarithm of the gain of all steps but step 0
     first_gain: float = 0.0  # logarithm of the gain of step 0
@@ -108,8 +109,9 @@ def _sheet_coefficients(plan: Plan, scene: Scene) -> NDArray[Any]:
     material = derive_material(scene, {})
     springs = [material.across, material.down, material.shear, material.tension]
     steps = () if scene.time.at_rest else coefficients(replace(plan, scene=scene, material=material))
-    laws = [each or (0.0, 0.0) for each in (material.stiffening, material.virtual_stiffening)]
-    return np.array([*springs, material.virtual, material.bending, *laws[0], *laws[1], *steps])
+    laws = (law for law in (material.stiffening, material.virtual_stiffening) if law)
+    of_laws = [number for law in laws for number in (law.scale, *law.shape)]
+    return np.array([*springs, material.virtual, material.bending, *of_laws, *steps])
 
 
 def _coefficient_gradient(plan: Plan, gradient: SheetGradient) -> Array:
@@ -130,8 +132,9 @@ def _coefficient_gradient(plan: Plan, gradient: SheetGradient) -> Array:
         _from_logarithm(gradient.bending, material.bending),
     ]
     laws = (material.stiffening, gradient.stiffening), (material.virtual_stiffening, gradient.foundation_stiffening)
-    for law, (by_lock, by_factor) in laws:
-        derivatives += [_from_logarithm(by_lock, law.lock), by_factor] if law else [0.0, 0.0]
+    for law, by_numbers in laws:
+        if law:
+            derivatives += [_from_logarithm(by_numbers[0], law.scale), *by_numbers[1 : 1 + law.law.shape_count]]
     if not plan.scene.time.at_rest:
         _, gain, first_gain = coefficients(plan)
         derivatives += [gradient.keep, gradient.gain / gain, gradient.first_gain / first_gain]
@@ -161,19 +164,28 @@ def _material_numbers(scene: Scene) -> Iterator[tuple[str, float]]:
     if tissue is None:
         static, dynamic = ["springs.structural", "springs.shear", "springs.virtual"], ["sheet.mass", "damping"]
     else:
-        law, foundation = tissue.foundation, ["foundation"]
-        # With a factor of 1 a law is linear, and has no derivative with respect to its numbers.
-        if isinstance(law, Foundation):
-            locks = law.lock and law.factor > 1
-            foundation = [f"foundation.{name}" for name in ("young", "depth", *(("lock", "factor") if locks else ()))]
-        stiffens = tissue.stiffening is not None and tissue.stiffening.factor > 1
-        stiffening = ["stiffening.lock", "stiffening.factor"] if stiffens else []
-        names = ["young", "thickness", *foundation, "pretension", "bending", *stiffening]
+        foundation = ["foundation"]
+        if isinstance(tissue.foundation, Foundation):
+            foundation = ["foundation.young", "foundation.depth", *_law_keys("foundation", tissue.foundation)]
+        names = [
+            "young",
+            "thickness",
+            *foundation,
+            "pretension",
+            "bending",
+            *_law_keys("stiffening", tissue.stiffening),
+        ]
         static, dynamic = [f"tissue.{name}" for name in names], ["tissue.density", "tissue.damping"]
     for key in static if scene.time.at_rest else static + dynamic:
         value = attrgetter(key)(scene)
         if value and not isinstance(value, str):
             yield key, value
+
+
+def _law_keys(name: str, section: Section | None) -> list[str]:
+    """Return the keys of the numbers of a section's law; a linear one has no derivatives by them."""
+    law = law_of(section)
+    return [f"{name}.{key}" for key in (law.law.scale, *law.law.keys)] if law else []
 
 
 def _with_value(section: Any, key: str, value: complex) -> Any:

@@ -62,17 +62,19 @@ SPRING_PARTS, FOUNDATION_PART, SUM_PARTS = 0, 3, 4
 # KEEP_SUM              q . u, for the derivative with respect to keep
 # TENSION_SUMS          derivatives with respect to tau of each family of springs, 3 sums
 # BENDING_SUM           derivative with respect to log D
-# LOCK_SUMS             derivatives with respect to log(lock) and factor of the springs
-# FOUNDATION_LOCK_SUMS  the same for the foundation
+# LAW_SUMS              derivatives with respect to log m and the shape of the law of springs, LAW_NUMBERS sums at most
+# FOUNDATION_LAW_SUMS   the same for the foundation
 # ROW_SUMS              number of sums
-KEEP_SUM, TENSION_SUMS, BENDING_SUM, LOCK_SUMS, FOUNDATION_LOCK_SUMS, ROW_SUMS = 0, 1, 4, 5, 7, 9
+LAW_NUMBERS = 4
+KEEP_SUM, TENSION_SUMS, BENDING_SUM, LAW_SUMS = 0, 1, 4, 5
+FOUNDATION_LAW_SUMS, ROW_SUMS = LAW_SUMS + LAW_NUMBERS, LAW_SUMS + 2 * LAW_NUMBERS
 
 # Indices of the results of `SpringTerm.build_spring_tangent`. After the change of the force, 3, the derivatives with
 # respect to
 # BY_STIFFNESS  k - tau
 # BY_TENSION    tau
-# BY_LOCK       log(lock) and factor, only of springs that lock
-BY_STIFFNESS, BY_TENSION, BY_LOCK = 3, 4, 5
+# BY_LAW        log m and the shape of their law
+BY_STIFFNESS, BY_TENSION, BY_LAW = 3, 4, 5
 
 # Derivatives per slot, step and row: with respect to the force, 3, and the control point, 2.
 LOAD_DERIVATIVES = 5
@@ -267,9 +269,10 @@ def _build_sweep_row(code: KernelConfig) -> Callable[..., None]:
     slots, stationary = len(probes.moves), probes.moves.count(False)
     foundation = code.first_column(FoundationTerm) if foundation_term else 0
     foundation_derivatives = [foundation_term.build_derivatives(code)] if foundation_term else []
-    stiffness_functions = [foundation_term.build_stiffness(code)] if foundation_term and foundation_term.locks else []
-    locks = springs.law.parameter_count > 0
-    results = BY_LOCK + 2 if locks else BY_LOCK
+    stiffness_functions = [foundation_term.build_stiffness(code)] if foundation_term and foundation_term.law else []
+    law, foundation_law = springs.law, foundation_term.law if foundation_term else None
+    numbers, foundation_numbers = (1 + each.shape_count if each else 0 for each in (law, foundation_law))
+    results = BY_LAW + numbers
 
     @ti.func
     def spring_tangent(sheet: ti.template(), offset, p, q, x0, y0, length, k, family: ti.template()):
@@ -361,14 +364,13 @@ def _build_sweep_row(code: KernelConfig) -> Callable[..., None]:
                         add(sheet.derivatives, index, by_foundation[0] * (0 - now[foundation]))
                         for stiffness_at in ti.static(stiffness_functions):
                             k = stiffness_at(sheet, entry, now[foundation])
-                            for n in ti.static(range(2)):
-                                at_sum = ti.static(FOUNDATION_LOCK_SUMS + n)
+                            for n in ti.static(range(foundation_numbers)):
+                                at_sum = ti.static(FOUNDATION_LAW_SUMS + n)
                                 sums[at_sum] = sums[at_sum] - k * by_foundation[1 + n]
-                    if ti.static(locks):
-                        for n in ti.static(range(2)):
-                            by_lock = ti.static(BY_LOCK + n)
-                            of_springs = (right[by_lock] + down[by_lock]) + (falling[by_lock] + rising[by_lock])
-                            sums[LOCK_SUMS + n] = sums[LOCK_SUMS + n] - of_springs
+                    for n in ti.static(range(numbers)):
+                        by_law = ti.static(BY_LAW + n)
+                        of_springs = (right[by_law] + down[by_law]) + (falling[by_law] + rising[by_law])
+                        sums[LAW_SUMS + n] = sums[LAW_SUMS + n] - of_springs
                     if ti.static(tension):
                         sums[TENSION_SUMS + ALONG_ROW] = sums[TENSION_SUMS + ALONG_ROW] - right[BY_TENSION]
                         sums[TENSION_SUMS + ALONG_COLUMN] = sums[TENSION_SUMS + ALONG_COLUMN] - down[BY_TENSION]

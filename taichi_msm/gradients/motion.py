@@ -291,7 +291,7 @@ class MotionAdjoint:
         # In the order of `SPRING_PARTS` and `KEEP_SUM` in `kernel_motion`.
         along_rows, along_columns, diagonals, foundation = parts
         springs = along_rows[:, :-1], along_columns[:-1], diagonals[:-1, :-1]
-        ends = kernels.TENSION_SUMS, kernels.BENDING_SUM, kernels.LOCK_SUMS, kernels.FOUNDATION_LOCK_SUMS
+        ends = kernels.TENSION_SUMS, kernels.BENDING_SUM, kernels.LAW_SUMS, kernels.FOUNDATION_LAW_SUMS
         keep, tensions, bending, stiffening, foundation_stiffening = np.split(sums, ends)
         foundation = foundation * point_shares(self.plan)
         gradient = SheetGradient(springs, tensions, foundation, float(bending[0]), stiffening, foundation_stiffening)

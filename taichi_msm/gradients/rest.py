@@ -23,7 +23,7 @@ from taichi_msm.model.sheet import spacing
 from taichi_msm.solver.rest import QuasiStatics
 from taichi_msm.system.runtime import Device
 from taichi_msm.terms.elasticity import SpringFamily, spring_families
-from taichi_msm.terms.foundation import foundation_derivatives, foundation_force, foundation_tangent, point_shares
+from taichi_msm.terms.foundation import FoundationForce, foundation_force, point_shares
 
 if TYPE_CHECKING:
     from scipy.sparse import csc_matrix
@@ -88,10 +88,12 @@ class RestAdjoint:
             MsmError: when the tangent stiffness is singular.
         """
         plan, (rows, cols) = self.plan, self.plan.scene.sheet.points
+        laws = plan.material.stiffening, plan.material.virtual_stiffening
         families, laplacian = list(spring_families(plan)), _laplacian(plan)
         gradient = SheetGradient(
             (np.zeros((rows, cols - 1)), np.zeros((rows - 1, cols)), np.zeros((rows - 1, cols - 1))),
-            np.zeros(3), np.zeros((rows, cols)), 0.0, np.zeros(2), np.zeros(2),
+            np.zeros(3), np.zeros((rows, cols)), 0.0,
+            *(np.zeros(law.law.shape_count + 1 if law else 0) for law in laws),
         )  # fmt: skip
         loads = LoadGradient(plan)
         for n, by_displacement in enumerate(by_frame):
@@ -101,7 +103,8 @@ class RestAdjoint:
                 continue
             at_frame = evaluate_frame_loads(plan, n)
             foundation = plan.material.virtual * at_frame.active[0] * point_shares(plan)
-            stiffness = _stiffness(plan, families, foundation, laplacian, u)
+            of_foundation = foundation_force(plan.material, foundation, u)
+            stiffness = _stiffness(plan, families, of_foundation, laplacian, u)
             p = _run_interruptibly(partial(_solve, plan, stiffness, by_displacement), pause)
             if p is None:
                 if not u.any():
@@ -111,11 +114,8 @@ class RestAdjoint:
                     "pretension or bending"
                 )
             _add_springs(gradient, families, u, p)
-            gradient.foundation_stiffening += [
-                float((by_number * p[..., 2]).sum())
-                for by_number in foundation_derivatives(plan.material, foundation, u[..., 2])
-            ]
-            gradient.foundation += (foundation_force(plan.material, foundation, u) * p).sum(axis=-1)
+            gradient.foundation_stiffening += [float((by * p[..., 2]).sum()) for by in of_foundation.by_numbers]
+            gradient.foundation += (of_foundation.force * p).sum(axis=-1)
             curvatures = laplacian @ u.reshape(-1, 3), laplacian @ p.reshape(-1, 3)
             gradient.bending -= plan.material.bending * float((curvatures[0] * curvatures[1]).sum())
             self._add_loads(loads, n, at_frame, p)
@@ -140,24 +140,24 @@ def _add_springs(gradient: SheetGradient, families: Sequence[SpringFamily], u: A
         q, edges, square_difference, square = family.elongation(u)
         p_difference = p[family.start] - p[family.end]
         along = (p_difference * edges).sum(axis=-1)
-        _, _, by_stiffness, by_tension = family.derivatives(square_difference, square, along)
+        _, _, by_stiffness, by_tension, by_numbers = family.derivatives(square_difference, square, along)
         index = min(n, 2)  # both diagonals count as one family
         gradient.springs[index][...] += by_stiffness * along
-        gradient.stiffening += [
-            float((by * along).sum()) for by in family.parameter_derivatives(square_difference, square)
-        ]
+        gradient.stiffening += [float((by * along).sum()) for by in by_numbers]
         gradient.tensions[index] += (p_difference * q).sum() + (by_tension * along).sum()
 
 
-def _stiffness(plan: Plan, families: Sequence[SpringFamily], foundation: Array, laplacian: Any, u: Array) -> csc_matrix:
+def _stiffness(
+    plan: Plan, families: Sequence[SpringFamily], foundation: FoundationForce, laplacian: Any, u: Array
+) -> csc_matrix:
     """Assemble the tangent stiffness K [N/m], in the order x, y, z of each mass point."""
     from scipy import sparse
 
     shape = plan.scene.sheet.points
     number, axis = np.arange(plan.fixed.size).reshape(shape), np.arange(3)
-    total = sparse.diags(
-        foundation_tangent(plan.material, foundation, u).ravel()
-    ) + plan.material.bending * sparse.kron(laplacian.T @ laplacian, sparse.identity(3))
+    total = sparse.diags(foundation.tangent.ravel()) + plan.material.bending * sparse.kron(
+        laplacian.T @ laplacian, sparse.identity(3)
+    )
     for family in families:
         blocks = family.tangent(u).reshape(-1, 3, 3)
         p, q = (3 * number[end].reshape(-1, 1, 1) for end in (family.start, family.end))

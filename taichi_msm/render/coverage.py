@@ -17,7 +17,6 @@ from collections.abc import Callable
 from functools import cache
 from typing import Any, NamedTuple
 
-from taichi_msm.arithmetic import Operations
 from taichi_msm.render import geometry
 from taichi_msm.render import uniforms as uni
 from taichi_msm.render.config import (
@@ -37,7 +36,7 @@ from taichi_msm.render.config import (
 from taichi_msm.render.lens_kernels import distorted_point
 from taichi_msm.render.undistortion import INVALID_COORDINATE
 from taichi_msm.shapes import SHAPES
-from taichi_msm.system.runtime import ti
+from taichi_msm.system.runtime import kernel_operations, ti
 
 
 class Cell(NamedTuple):
@@ -202,7 +201,7 @@ def cover_cell(i, j, invertible, first, end, outline: ti.template(), band: ti.te
 @cache
 def _compile_ray(shape: str) -> Callable[..., Any]:
     """Return `Shape.build_ray` of a shape as a Taichi function."""
-    return ti.func(SHAPES[shape].build_ray(Operations(ti.sqrt, ti.log, ti.max, ti.min, ti.select, ti.func)))
+    return ti.func(SHAPES[shape].build_ray(kernel_operations()))
 
 
 @ti.func

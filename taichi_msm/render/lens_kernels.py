@@ -9,10 +9,9 @@ from functools import cache
 from typing import Any
 
 from taichi_msm.lenses import MODELS
-from taichi_msm.lenses.model import Operations
 from taichi_msm.render import uniforms as uni
 from taichi_msm.render.undistortion import INVALID_COORDINATE
-from taichi_msm.system.runtime import ti
+from taichi_msm.system.runtime import kernel_operations, ti
 
 # The arctangent halves the angle HALVINGS times, and sums the power series of the remaining angle, whose terms have the
 # divisors SERIES, smallest term first.
@@ -38,7 +37,7 @@ def _arctangent(tangent):
 @cache
 def compile_lens(lens: str) -> Callable[..., Any]:
     """Wrap the formula of a lens model for kernels."""
-    return ti.func(MODELS[lens].build(Operations(ti.sqrt, _arctangent, ti.max, ti.func)))
+    return ti.func(MODELS[lens].build(kernel_operations()._replace(arctan=_arctangent)))
 
 
 @ti.func
