@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from taichi_msm.errors import MsmError, Pause
 from taichi_msm.gradients.chain_rule import LoadGradient, SheetGradient
+from taichi_msm.laws.law import LawNumbers
 from taichi_msm.model.loads import Schedule, decay, decay_gradient, evaluate_frame_loads
 from taichi_msm.model.plan import Plan
 from taichi_msm.model.sheet import spacing
@@ -88,12 +89,11 @@ class RestAdjoint:
             MsmError: when the tangent stiffness is singular.
         """
         plan, (rows, cols) = self.plan, self.plan.scene.sheet.points
-        laws = plan.material.stiffening, plan.material.virtual_stiffening
         families, laplacian = list(spring_families(plan)), _laplacian(plan)
         gradient = SheetGradient(
             (np.zeros((rows, cols - 1)), np.zeros((rows - 1, cols)), np.zeros((rows - 1, cols - 1))),
-            np.zeros(3), np.zeros((rows, cols)), 0.0,
-            *(np.zeros(law.law.shape_count + 1 if law else 0) for law in laws),
+            np.zeros(3), np.zeros((rows, cols)), 0.0, _zeros(plan.material.stiffening),
+            _zeros(plan.material.virtual_stiffening),
         )  # fmt: skip
         loads = LoadGradient(plan)
         for n, by_displacement in enumerate(by_frame):
@@ -132,6 +132,11 @@ class RestAdjoint:
         time = frame / self.plan.grid.frames_per_second
         margin = 1e-3 / self.plan.grid.frames_per_second
         loads.add(lambda plan: evaluate_frame_loads(plan, frame), by_slot, (time - margin, time + margin))
+
+
+def _zeros(law: LawNumbers | None) -> Array:
+    """Return zeros for the derivatives by log m and the shape of a law."""
+    return np.zeros(law.law.shape_count + 1 if law else 0)
 
 
 def _add_springs(gradient: SheetGradient, families: Sequence[SpringFamily], u: Array, p: Array) -> None:

@@ -130,7 +130,7 @@ def kernel_operations(lanes: int | None = None) -> Operations:
         @ti.func
         def apply(values):  # type: ignore[no-untyped-def]
             result = values
-            for lane in ti.static(range(lanes)):
+            for lane in ti.static(range(lanes or 0)):
                 result[lane] = function(values[lane])
             return result
 

@@ -20,7 +20,7 @@ and twice its energy is (k - tau) (L - L0)^2 + tau q^2, plus k L0^2 times twice 
 
 # No `from __future__ import annotations` here: Taichi reads the functions.
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
 from taichi_msm.arithmetic import Operations
@@ -70,19 +70,19 @@ def build_law(law: Law, operations: Operations) -> LawFunctions:
         numerator, denominator = ratio(x, *shape)
         return numerator / denominator
 
-    def differentiate(x, shape, direction):
+    def differentiate(x: Any, shape: Sequence[Any], direction: int) -> Dual:
         """Return `secant` as a dual number along x, direction 0, or along a number of the shape."""
-        numbers = [
-            Dual(number, hold((1 if n == direction else 0) + 0 * x), hold) for n, number in enumerate((x, *shape))
-        ]
+        slopes = [hold((1 if n == direction else 0) + 0 * x) for n in range(1 + len(shape))]
+        numbers = [Dual(*each, hold) for each in zip((x, *shape), slopes, strict=True)]
         numerator, denominator = dual_ratio(*numbers)
-        return numerator / denominator
+        quotient: Dual = numerator / denominator
+        return quotient
 
-    def tangent(x, shape):
+    def tangent(x: Any, shape: Sequence[Any]) -> Any:
         along_x = differentiate(x, shape, 0)
         return along_x.value + x * along_x.slope
 
-    def by_shape(x, shape):
+    def by_shape(x: Any, shape: Sequence[Any]) -> list[Any]:
         return [differentiate(x, shape, 1 + n).slope for n in range(len(shape))]
 
     return LawFunctions(ratio, operations.wrap(secant), tangent, by_shape, operations.wrap(formulas.integral))
