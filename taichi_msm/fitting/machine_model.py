@@ -244,7 +244,8 @@ def _make_parameters(
     for key, test in zip(contacts, tests, strict=True):
         if key in free:
             # Depths of contact are in metres, as in the table; x is in units of their range.
-            first, last = float(test.depth[0]), float(test.depth.max())
+            # The depth of the row of contact may be below that of the first row, by noise.
+            first, last = min(float(test.depth[0]), test.contact), float(test.depth.max())
             low, high = bounds.get(key, (first, last))
             low, high = max(first, low), min(last, high)
             if not (low <= test.contact <= high and low < high):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import click
@@ -156,6 +157,26 @@ def test_a_contact_at_the_greatest_depth_has_no_curve(pressed: str, message: Mes
         assert runs.predict_coarse(problem.limits[1], 0) is None
         with message.raises(SceneError, "contact"):
             runs.run_curve(problem.limits[1])
+
+
+def test_starts_are_within_bounds(pressed: str) -> None:
+    """Too large shares are scaled down, a share at most to its bound; a trust region has a width."""
+    start = scene(relaxation=[{"share": 0.8, "time": 0.6}, {"share": 0.1, "time": 5.0}])
+    free = [SHARE, SHARE.replace("0", "1"), TIME]
+    bounds = {SHARE: (0.7, 0.9), SHARE.replace("0", "1"): (1e-14, 0.9)}
+    problem = read_machine_problem([pressed], start, free, bounds, None, {"contact": [CONTACT]})
+    low, high = problem.limits
+    with CurveRuns(problem, 1, lambda stage, done, total: None) as runs:
+        assert runs.with_valid_shares(np.zeros(3)).tolist() == [0, 0, 0]
+        valid = runs.with_valid_shares(high)
+        # 0.9 + 0.9 becomes 0.49 + 0.49, then 0.7 + 0.28.
+        shares = [problem.parameters[n].value(valid[n]) for n in range(2)]
+        assert shares == pytest.approx([0.7, 0.28])
+        assert (low <= valid).all()
+        runs._tangent = SimpleNamespace(reach=1e-3)  # type: ignore[assignment]
+        first, last = runs.trust_region(low, np.zeros(3))
+        assert (low <= first).all()
+        assert (first < last).all()
 
 
 def test_rejection_of_a_contact_found_in_a_slack(device: Device, tmp_path: Path, message: Messages) -> None:
