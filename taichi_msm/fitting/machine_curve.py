@@ -210,6 +210,21 @@ class CurveRuns(Runs):
         below = np.where(self._is_contact, np.minimum(region, margin), region)
         return np.maximum(low, x - below), np.minimum(high, x + region)
 
+    def contact_slopes(self, x: Array) -> Array:
+        """Return the derivatives of the forces by the estimated depths of contact, shape (frames of all tests, m).
+
+        Depths of contact that are given, or parameters, have no column.
+        """
+        values = self._model.values(x)
+        reach = self._reach(values)
+        forces, step = self._forces(values, reach), 1e-3 * reach
+        columns = []
+        for loading, key in zip(self.problem.tests, self.problem.contact_keys, strict=True):
+            if loading.finds_contact and key not in values:
+                moved = [self._predict(values | {key: loading.contact + end}, reach, forces) for end in (step, -step)]
+                columns.append((moved[0].values[0] - moved[1].values[0]) / (2 * step))
+        return np.hstack([np.empty((sum(len(loading.force) for loading in self.problem.tests), 0)), *columns])
+
     def _reach(self, values: dict[str, float]) -> float:
         """Return the greatest travel of a curve [m]; raise a SceneError if it is 0 in all tests."""
         if not (reach := self.problem.reach(values)):
