@@ -122,7 +122,7 @@ def try_test(kind: Kind, seed: int) -> Result:
         low, high = estimate.interval
         covered = (low is None or low <= value) and (high is None or value <= high)
         compared[key.rpartition(".")[2]] = (covered, (estimate.value - value) / estimate.standard_error)
-    # Not intervals: whether the model, which is right, is rejected, and whether a note reports the error of the contact.
+    # Not intervals: whether the right model is rejected, and whether a note reports the error of the contact.
     is_noted = any("found from the noise" in note for note in result.notes)
     return compared | {"rejected": (result.model_rejected, np.nan), "noted": (is_noted, np.nan)}
 
