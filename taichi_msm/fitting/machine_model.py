@@ -71,9 +71,10 @@ class MachineForces(Forces, ObservationModel):
             unit = (loading.information > 0) / loading.sigma
             part = (part.T * (unit > 0)).T
             centred = part - np.multiply.outer(unit, unit @ part / (unit @ unit))
-            for _ in range(0 if robust_factor is None else ROBUST_STEPS):
-                weights = unit / np.sqrt(robust_factor(centred))
-                centred = part - unit * (weights @ part / (weights @ unit))
+            if robust_factor is not None:
+                for _ in range(ROBUST_STEPS):
+                    weights = unit / np.sqrt(robust_factor(centred))
+                    centred = part - unit * (weights @ part / (weights @ unit))
             parts.append(centred)
         return np.concatenate(parts)
 

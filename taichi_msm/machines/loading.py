@@ -340,11 +340,11 @@ def _means(coordinate: Array, at: Array, half_width: float, test: MachineTest) -
     count = np.maximum(high - low, 1)
     starts, ends = (np.bincount(rows, minlength=len(coordinate) + 1) for rows in (low, high))
     own = sums(1 / np.maximum(np.cumsum(starts - ends)[:-1], 1))
-    means = (
+    time, depth, force = (
         np.where(high > low, sums(column) / count, np.interp(at, coordinate, column))
         for column in (test.time, test.depth, test.force)
     )
-    return _Frames(*means, own, own / count)
+    return _Frames(time, depth, force, own, own / count)
 
 
 def _row_deviation(test: MachineTest, size: int) -> tuple[float, float]:

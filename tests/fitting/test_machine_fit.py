@@ -216,17 +216,18 @@ def test_uncertainty_of_the_offsets() -> None:
     """It is that of least squares with one more parameter per test, also in profiles."""
     misfit, runs = linear_problem()
     (observed,) = misfit.observations
+    assert isinstance(observed, MachineForces)
     frames = np.repeat(np.eye(2), len(observed.values) // 2, axis=0)
     information = np.concatenate([test.information for test in observed.tests])
     matrix = np.hstack([runs.slopes, frames]) * ((information > 0) / observed.sigma)[:, None]
     scaled = observed.values[:, 0] / observed.sigma * (information > 0)
-    expected, squares = np.linalg.lstsq(matrix, scaled, rcond=None)[:2]
     covariance = np.linalg.inv(matrix.T @ matrix)
+    expected: Array = covariance @ matrix.T @ scaled
     predicted = runs.predict_many([expected[:2]])[0]
     cost = misfit.cost(misfit.residuals(predicted, misfit.scales([1.0])))
     solution = Solution(expected[:2], predicted, misfit.scales([1.0]), cost, converged=True)
     found = uncertainty(misfit, solution, runs.slopes, ErrorCorrelation(None, None))
-    assert 2 * cost == pytest.approx(squares[0])
+    assert 2 * cost == pytest.approx(np.sum((matrix @ expected - scaled) ** 2))
     assert found.freedom == round(information.sum()) - 4
     np.testing.assert_allclose(found.root @ found.root.T, found.factor * covariance[:2, :2], rtol=1e-9)
     tests = fitted_tests(runs.problem, {}, predicted.values[0], runs.slopes, found)
