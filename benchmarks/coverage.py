@@ -5,7 +5,7 @@
 Synthetic tests of strips in a clamp and of a ball have random tissue, a random force offset, and noise of 1 % of the
 peak force. Measured and fitted forces are of the same mesh, so that mesh errors do not enter. Prints a row per kind of
 test: the number of intervals that contain the true value, and the root mean square of the errors in standard errors.
-TESTS are 200 by default, and take about ten minutes of a core.
+TESTS are 200 by default, and take a quarter of an hour of a core.
 """
 
 from __future__ import annotations
