@@ -18,8 +18,7 @@ def _cameras(file: CameraFile) -> Sequence[Keys]:
     """Return the keys of the camera, if the file begins with the comment of OCamCalib."""
     if not file.text.lstrip().startswith("#polynomial coefficients"):
         return ()
-    lines = [(n, line.strip()) for n, line in enumerate(file.text.splitlines(), 1)]
-    rows = dict(zip(LINES, ((n, line) for n, line in lines if line and line[0] != "#"), strict=False))
+    rows = dict(zip(LINES, ((n, line) for n, line in file.lines if line[0] != "#"), strict=False))
     return [
         Keys(file, {name: line for name, (_, line) in rows.items()}, lines={name: n for name, (n, _) in rows.items()})
     ]
