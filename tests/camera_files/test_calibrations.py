@@ -11,6 +11,7 @@ from typing import Literal
 import cv2
 import numpy as np
 import pytest
+import yaml
 
 from taichi_msm import load_scene
 from taichi_msm.camera_files.calibration import Calibration
@@ -209,6 +210,58 @@ def test_stereo_pair(write: Callable[[], str], unit: Literal["mm"] | None, small
     np.testing.assert_allclose(right.right.translation, TRANSLATION / 1e3, rtol=1e-15)
 
 
+# Further results of stereoCalibrate and stereoRectify, by their names in files. F is no focal length.
+FURTHER: dict[str, object] = {
+    "E": [[0, -0.0002, 0.0001], [0.0002, 0, 0.0797], [-0.0001, -0.0797, 0]],
+    "F": [[0, -6e-10, 1e-6], [6e-10, 0, 2e-4], [-1e-6, -2e7, 1]],
+    **{"R1": np.eye(3).tolist(), "R2": np.eye(3).tolist(), "P1": np.eye(3, 4).tolist(), "P2": np.eye(3, 4).tolist()},
+    **{"Q": np.eye(4).tolist(), "roi1": [0, 0, 40, 30], "roi2": [1, 0, 38, 30], "alpha": 0.5, "map1x": [[0.5]]},
+    **{"rms_error": 0.3, "perViewErrors": [[0.1, 0.2]], "rvecs": [[0, 0, 1]], "tvecs": [[0, 0, 1]], "board": [9, 6]},
+}
+# Patterns of names in public files: matrix and distortion, with {} for the mark of a camera; marks; R; T.
+NAMES = [
+    ("K{}", "D{}", ("1", "2"), "R", "T"),
+    ("CM{}", "D{}", ("1", "2"), "R", "T"),
+    ("intrinsic{}", "distCoeffs{}", ("1", "2"), "R", "T"),
+    ("{}_cameraMatrix", "{}_distCoeffs", ("l", "r"), "R", "T"),
+    ("{}_Camera_Matrix", "{}_Distortion_Coefficients", ("Left", "Right"), "Rotation_Matrix", "Translation_Matrix"),
+    ("camera_matrix_{}", "dist_coeffs_{}", ("left", "right"), "rotation_matrix", "translation_vector"),
+    ("{}_cam_mat", "{}_distort", ("left", "right"), "R", "T"),
+    ("camera_intrinsics_{}", "distortion_coefficients_{}", ("0", "1"), "rotation_matrix", "translation_vector"),
+    ("{}_camera.camera_matrix", "{}_camera.dist_coeffs", ("left", "right"), "stereo.rotation", "stereo.translation"),
+    ("{}_intrinsics.K", "{}_intrinsics.D", ("left", "right"), "extrinsics.R", "extrinsics.T"),
+]
+
+
+@pytest.mark.parametrize("names", NAMES, ids=[names[0] for names in NAMES])
+def test_results_of_stereo_calibrate(names: tuple[str, str, tuple[str, str], str, str], small: Path) -> None:
+    matrix, distortion, marks, rotation, translation = names
+    values: dict[str, object] = {
+        rotation: ROTATION.tolist(),
+        translation: [[t] for t in (TRANSLATION / 1e3).tolist()],
+        **FURTHER,
+    }
+    for mark, camera, coefficients in zip(marks, (MATRIX, RIGHT), (COEFFICIENTS, [0.25, 0, 0, 0]), strict=True):
+        values |= {matrix.format(mark): camera.tolist(), distortion.format(mark): [coefficients]}
+    nested: dict[str, object] = {"image_size": {"width": 40, "height": 30}}
+    for name, value in values.items():
+        section, _, key = name.rpartition(".")
+        part = nested.setdefault(section, {}) if section else nested
+        assert isinstance(part, dict)
+        part[key] = value
+    for text in (json.dumps(nested), yaml.safe_dump(nested)):
+        left, right = read(text), read(text, "right")
+        assert (left.focal, right.focal, left.size) == ((61.5, 60.5), (62.5, 61.5), (40, 30))
+        assert [*left.coefficients.values()] == COEFFICIENTS
+        assert right.right is not None
+        np.testing.assert_array_equal(right.right.rotation, ROTATION)
+        np.testing.assert_allclose(right.right.translation, TRANSLATION / 1e3, rtol=1e-15)
+
+
+def test_fundamental_matrix_of_one_camera(small: Path) -> None:
+    assert read(f"{K}{D}F: [[0, 0, 1], [0, 0, 2], [3, 4, 1]]\n").focal == (61.5, 60.5)
+
+
 def test_stereo_pair_without_unit_or_right_camera(small: Path, message: Messages) -> None:
     with message.raises(CameraFileError, "camera.yml", "calibration_unit"):
         read(stereo("M", "D", "1", "2"), "right")
@@ -330,6 +383,7 @@ def test_picture_size_and_scale(small: Path, message: Messages) -> None:
 
 K = "K: [61.5, 0, 19.25, 0, 60.5, 14.75, 0, 0, 1]\n"
 D = "D: [-0.3, 0.1, 0.001, -0.002, 0.03]\n"
+HOMOGENEOUS = "K: [FX, 0, 19.25, 0, 0, 60.5, 14.75, 0, 0, 0, 1, 0, 0, 0, 0, 1]\n"
 NORMALISED = "D: [0, 0, 0, 0]\nK: [0.837, 0, 0.5, 0, 1.1, 0.5, 0, 0, 1]\n"
 
 
@@ -356,6 +410,7 @@ NORMALISED = "D: [0, 0, 0, 0]\nK: [0.837, 0, 0.5, 0, 1.1, 0.5, 0, 0, 1]\n"
         pytest.param(K.replace("61.5", "1e9") + D, id="large number"),
         pytest.param(NORMALISED + "image_size: [40, 30]\n", id="normalised focal length"),
         pytest.param(NORMALISED, id="normalised focal length without size"),
+        pytest.param(HOMOGENEOUS.replace("FX", "0.82") + D + "size: [1280, 1024]\n", id="normalised 4 x 4"),
         pytest.param(K + D + "width: 40", id="width alone"),
         pytest.param(K + D + "width: 40\nheight: 30\nimage_size: [80, 60]", id="two sizes"),
         pytest.param(K + "note: 3", id="no distortion"),
@@ -402,6 +457,7 @@ def test_spellings(small: Path) -> None:
     keys = ("DistCoeff", "distortion_coefs", "dist", "d", "DISTORTION_PARAMETERS", "distortion_vector")
     texts = [f"{K}{key}: [[-0.3, 0.1, 0.001, -0.002, 0.03]]" for key in keys]
     texts += [K.replace("K", key) + D for key in ("mtx", "camera_mtx", "intrinsic_matrix", "cameraMatrix", "M")]
+    texts += [HOMOGENEOUS.replace("FX", "61.5") + D]
     # Twice, equal up to rounding.
     texts += [f"{K}{D}mtx: [61.5, 0, 19.25, 0, 60.50000001, 14.75, 0, 0, 1]\ndist: {[COEFFICIENTS]}"]
     for text in texts:
