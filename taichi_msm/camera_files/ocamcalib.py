@@ -1,4 +1,7 @@
-"""calib_results.txt of OCamCalib: Scaramuzza's polynomial, with x down, y to the right and the axis backward."""
+"""calib_results.txt of OCamCalib: Scaramuzza's polynomial, with x down, y to the right and the axis backward.
+
+Its centre counts from 0, as in OpenCV; OCamCalib writes the centre of its MATLAB model minus 1.
+"""
 
 from __future__ import annotations
 

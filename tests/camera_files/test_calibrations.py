@@ -315,6 +315,28 @@ def test_ocamcalib(small: Path) -> None:
     assert camera.focal_lengths == (1.02 * 120, 1.02 * 120)
 
 
+# C3VD's colonoscope as calib_results.txt.
+C3VD = """\
+#polynomial coefficients
+5 -769.243600037458 0 8.12770624150226e-4 -6.25674244578925e-7 1.19662182144280e-9
+1 0
+542.975887548343 678.544839263292
+1 0 0
+1080 1350
+"""
+
+
+def test_colonoscope_in_the_documentation(small: Path, root: Path) -> None:
+    """The centres of C3VD and of calib_results.txt count from 0."""
+    lines = (root / "docs/cameras.md").read_text(encoding="utf-8").splitlines()
+    start = next(n for n, line in enumerate(lines) if "C3VD's colonoscope" in line)
+    example = yaml.safe_load("\n".join(lines[start : start + 3]))
+    calibration = read(C3VD)
+    np.testing.assert_allclose([*example["intrinsics"].values()], calibration.centre, atol=1e-6)
+    for name in ("a0", "a2", "a3", "a4"):
+        assert example["distortion"][name] == pytest.approx(calibration.coefficients[name], rel=1e-6)
+
+
 # Of the data set, without comments.
 EUROC = """\
 sensor_type: camera
