@@ -87,7 +87,7 @@ class _Split:
             raise ArgumentError(f"{fault}; take fewer, or a sweep of longer runs")
 
     def _select(self, runs: list[dict[str, Any]]) -> None:
-        # Number ("run"), folder, split ("part"), values, number of frames and frame size [px] of each run with a window.
+        # Number ("run"), folder, split ("part"), values, frames and frame size [px] of each run with a window.
         self.runs = [run for run in runs if run["frames"] >= self._length]
         windows = [(run["frames"] - self._length) // self._stride + 1 for run in self.runs]
         self._ends = [0, *accumulate(windows)]  # number of windows before each run, and in all
