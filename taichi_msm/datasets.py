@@ -62,6 +62,7 @@ class _Split:
 
     def __init__(self, directory: str | Path, split: str, length: int, stride: int, camera: str) -> None:
         require_path(directory)
+        require_path(camera, "camera", "take the name of a camera")
         self.directory, self._camera, self._length, self._stride = Path(directory), camera, length, stride
         path = self.directory / "dataset.json"
         with _reading(path, "name the folder that `taichi-msm sweep` wrote"):

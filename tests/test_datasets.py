@@ -115,6 +115,8 @@ def test_batches_of_a_loader(data_set: Path, torch: None) -> None:
 def test_invalid_data_set(data_set: Path, tmp_path: Path, message: Messages) -> None:
     with message.raises(ArgumentError, "'valid'"):
         Pairs(data_set, "valid")
+    with message.raises(ArgumentError, "camera: 3"):
+        Pairs(data_set, "train", 3)  # type: ignore[arg-type]
     with message.raises(FilesError, "dataset.json"):
         Pairs(tmp_path, "train")
     record = json.loads((data_set / "dataset.json").read_text())

@@ -464,6 +464,7 @@ NORMALISED = "D: [0, 0, 0, 0]\nK: [0.837, 0, 0.5, 0, 1.1, 0.5, 0, 0, 1]\n"
         pytest.param("; of two\n[StereoLeft]\nfc_x = 3\n", id="StereoMIS"),
         pytest.param("[StereoLeft]\na = 1\n[StereoRight]\nfc_x = 3\n", id="keys of StereoMIS"),
         pytest.param("[Camera]\nfc_x = 3\n", id="ini file"),
+        pytest.param("[StereoLeft]\nfc_x = 3 ; of the left camera\n# fc_y\nfc_y\n", id="line of an ini file"),
         pytest.param("# Camera list\n1 FOV 40 30 5e2 5e2 3e2 2e2 0.1\n", id="COLMAP"),
         pytest.param("1 PINHOLE 40 30 5e2 5e2 3e2 2e2\n2 PINHOLE 40 30 6e2 5e2 3e2 2e2\n", id="two of COLMAP"),
         pytest.param("1 PINHOLE 40 30 5e2 5e2 3e2\n", id="parameters of COLMAP"),
@@ -473,6 +474,32 @@ def test_invalid_calibration(text: str, small: Path, message: Messages) -> None:
     Path("camera.yml").write_text(text)
     with message.raises(SceneError, "render.camera.calibration: camera.yml"):
         camera_of("camera.yml")
+
+
+DIGITS = "1" * 5000
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        f"{K}{D}width: 0x{5000 * 'f'}",
+        f"{K}{D}0x{5000 * 'f'}: 1",
+        f"{K}{D}1:{DIGITS}: 1",
+        f'{{"K": {DIGITS}}}',
+        f"1 PINHOLE {DIGITS} 30 60 60 20 15",
+        KALIBR.replace("[61.5", f"[{DIGITS}"),
+    ],
+    ids=["hexadecimal", "hexadecimal key", "key", "JSON", "COLMAP", "Kalibr"],
+)
+def test_numbers_of_thousands_of_digits(text: str, small: Path) -> None:
+    with pytest.raises(CameraFileError, match="^camera"):
+        read(text)
+
+
+def test_names_of_thousands_of_digits(small: Path) -> None:
+    cameras = json.dumps(yaml.safe_load(KALIBR)).replace('"cam1"', f'"cam{DIGITS}"')
+    assert read(cameras, "right").focal == (62.5, 61.5)
+    assert read(f"{DIGITS} PINHOLE 40 30 60 60 20 15").size == (40, 30)
 
 
 def test_spellings(small: Path) -> None:
