@@ -134,7 +134,10 @@ def mixed(root: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     directory = tmp_path_factory.mktemp("mixed") / "data"
     overrides = {"sheet.points": [21, 21], "render.tracks": 4, "render.supersample": 1, "render.shading": "none"}
     overrides |= {"output": ["png", "depth", "flow", "occlusion", "tracks"]}
-    vary = {"time.duration": {"grid": [2 / 25, 4 / 25]}, "render.size": {"grid": [[64, 48], [48, 64]]}}
+    vary: dict[str, dict[str, Any]] = {
+        "time.duration": {"grid": [2 / 25, 4 / 25]},
+        "render.size": {"grid": [[64, 48], [48, 64]]},
+    }
     scene = root / "scenes/sweeps/tracking-scene.yaml"
     assert {row.status for row in sweep(scene, vary, directory, overrides=overrides, workers=1)} == {"complete"}
     text = (directory / "dataset.json").read_text()

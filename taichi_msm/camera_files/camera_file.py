@@ -251,8 +251,9 @@ def _xml(text: str) -> Entries:
 
 def _is_too_long(event: yaml.Event) -> bool:
     """Return whether an event is a number of more than MAX_DIGITS characters."""
-    is_plain = isinstance(event, yaml.ScalarEvent) and event.implicit[0] and len(event.value) > MAX_DIGITS
-    return is_plain and event.value[0] in "+-.0123456789"
+    if not (isinstance(event, yaml.ScalarEvent) and event.implicit[0]):
+        return False
+    return len(event.value) > MAX_DIGITS and event.value[0] in "+-.0123456789"
 
 
 def _ini(text: str) -> Entries:

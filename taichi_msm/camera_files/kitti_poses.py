@@ -16,7 +16,7 @@ def _read(file: CameraFile) -> Trajectory | None:
     import numpy as np
     from scipy.spatial.transform import Rotation
 
-    poses = []
+    poses: list[list[float]] = []
     for n, line in lines:
         numbers = parse_numbers(line.split())
         if numbers is None or len(numbers) != COUNT:
@@ -28,8 +28,8 @@ def _read(file: CameraFile) -> Trajectory | None:
     if (faults := (deviations > NORM_TOLERANCE) | (np.linalg.det(rotations) < 0)).any():
         fault = "its first three columns are not a rotation; write an orthonormal matrix"
         raise file.fault(fault, lines[int(faults.argmax())][0])
-    numbers = np.arange(len(poses))
-    rows = np.column_stack([numbers, matrices[:, :, 3], Rotation.from_matrix(rotations).as_quat()]).tolist()
+    quaternions = Rotation.from_matrix(rotations).as_quat()
+    rows = np.column_stack([np.arange(len(poses)), matrices[:, :, 3], quaternions]).tolist()
     return Trajectory(rows, [n for n, _ in lines], has_times=False)
 
 

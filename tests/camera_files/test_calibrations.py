@@ -492,7 +492,7 @@ DIGITS = "1" * 5000
     ids=["hexadecimal", "hexadecimal key", "key", "JSON", "COLMAP", "Kalibr"],
 )
 def test_numbers_of_thousands_of_digits(text: str, small: Path) -> None:
-    with pytest.raises(CameraFileError, match="^camera"):
+    with pytest.raises(CameraFileError, match="camera"):
         read(text)
 
 
