@@ -43,6 +43,9 @@ RESULT_COLUMNS = ("status", "error", "max_displacement", "shortest_spring", "err
 
 MAX_RUNS = 10**7
 
+# Limit of the folders in a pattern of files.
+MAX_FOLDERS = 100
+
 # Limit of SciPy's Sobol sequences.
 MAX_DIMENSIONS = 21201
 
@@ -523,6 +526,9 @@ def _relocate(vary: dict[str, Any], fixed: dict[str, Any], folder: Path, scene_f
 
 def _matching_files(pattern: str, folder: Path, key: Key) -> list[str]:
     """Return the files that match a pattern relative to a folder; for a key of pictures, only pictures."""
+    # `glob` calls itself for each folder, and takes quadratic time for brackets.
+    if len(pattern) > MAX_PATH or pattern.count("/") > MAX_FOLDERS:
+        return []
     suffixes = PICTURE_SUFFIXES if key in scene_file.PICTURE_KEYS else ("",)
     names = sorted(glob(pattern, root_dir=folder))  # noqa: PTH207  # Path.glob refuses absolute patterns
     return [text for text in names if text.lower().endswith(suffixes) and (folder / text).is_file()]
