@@ -123,18 +123,18 @@ def vector_bits() -> int:
     return next((bits for feature, bits in (("AVX512F", 512), ("AVX2", 256)) if _features.get(feature)), 128)
 
 
-def kernel_operations(lanes: int | None = None) -> Operations:
-    """Return the operations of a kernel, on vectors of lanes or on numbers."""
+def kernel_operations(vector: Any = None) -> Operations:
+    """Return the operations of a kernel, for vectors of a type and numbers, or for numbers alone."""
 
     def lanewise(function: Callable[..., Any]) -> Callable[..., Any]:
         @ti.func
         def apply(values):  # type: ignore[no-untyped-def]
-            result = values
-            for lane in ti.static(range(lanes or 0)):
-                result[lane] = function(values[lane])
+            result = values + vector(0)
+            for lane in ti.static(range(vector.n)):
+                result[lane] = function(result[lane])
             return result
 
-        return function if lanes is None else apply
+        return function if vector is None else apply
 
     log, exp, arctan = (lanewise(function) for function in (ti.log, ti.exp, lambda value: ti.atan2(value, 1.0)))
     return Operations(ti.sqrt, log, exp, arctan, ti.max, ti.min, ti.select, ti.func, ti.lang.impl.expr_init)

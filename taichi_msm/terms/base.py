@@ -236,7 +236,7 @@ class KernelConfig:
         """The operations of vectors, for laws and shapes."""
         from taichi_msm.system.runtime import kernel_operations
 
-        return kernel_operations(self.lanes)
+        return kernel_operations(self.vector)
 
     def get(self, kind: type[AnyTerm]) -> AnyTerm | None:
         """Return the term of a class; None if the scene does not have it."""
