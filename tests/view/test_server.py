@@ -8,7 +8,7 @@ import logging
 import re
 import signal
 import socket
-from collections.abc import AsyncIterator, Callable, Coroutine, Iterator
+from collections.abc import AsyncIterator, Callable, Coroutine, Iterator, Sequence
 from contextlib import ExitStack, asynccontextmanager, suppress
 from functools import partial, wraps
 from io import BytesIO
@@ -340,42 +340,54 @@ async def end(reader: asyncio.StreamReader) -> None:
             pass
 
 
+# Beginnings of requests: nothing, parts of the header and of two bodies, and a finished one on a connection kept alive.
+HOST = b" / HTTP/1.1\r\nHost: a\r\n"
+UNFINISHED = [
+    *(b"", b"GET /", b"GET" + HOST, b"POST" + HOST + b"Content-Length: 400\r\n\r\na"),
+    *(b"POST" + HOST + b"Transfer-Encoding: chunked\r\n\r\n5\r\nab", b"GET" + HOST + b"\r\n"),
+]
+
+
 @scenario
-async def test_unfinished_requests_end_and_connections_are_bounded(
+async def test_connections_are_bounded_in_number_and_time(
     session: Session, monkeypatch: pytest.MonkeyPatch, message: Messages
 ) -> None:
-    monkeypatch.setattr(server_module, "MAX_CONNECTIONS", 7)
-    monkeypatch.setattr(server_module, "MAX_REQUEST_S", 1.0)
-    lines: list[str] = []
-    async with served(session, warn=lines.append) as server:
-        port = server.url.split(":")[2].partition("/")[0]
-        page = await connect(server)
-        begun = (
-            *(b"", b"GET /", b"GET / HTTP/1.1\r\nHost: a\r\n", b"POST / HTTP/1.1\r\nContent-Length: 9\r\n\r\na"),
-            *(b"POST / HTTP/1.1\r\nTransfer-Encoding: chunked\r\n\r\n5\r\nab", b"GET /x HTTP/1.1\r\n\r\n"),
-        )
-        opened = []
-        for text in (*begun, *begun):
-            reader, writer = await asyncio.open_connection("127.0.0.1", port)
+    async def begin(texts: Sequence[bytes]) -> list[asyncio.StreamWriter]:
+        """Open connections with texts; `ends` has a task for the end of each."""
+        opened = [await asyncio.open_connection(url.hostname, url.port) for _ in texts]
+        ends.extend(asyncio.create_task(end(reader)) for reader, _ in opened)
+        for (_, writer), text in zip(opened, texts, strict=True):
             writer.write(text)
-            opened.append((reader, writer))
-        # Those above the limit end although the first ones are open.
-        for reader, _ in opened[len(begun) :]:
-            await end(reader)
-        time = monotonic()
-        while not opened[2][0].at_eof():
-            # A slow header, and a slow body.
-            opened[2][1].write(b"a")
-            opened[3][1].write(b"a")
+        return [writer for _, writer in opened]
+
+    lines: list[str] = []
+    ends: list[asyncio.Task[None]] = []
+    async with served(session, warn=lines.append) as server:
+        url = urlsplit(server.url)
+        page = await connect(server)
+        monkeypatch.setattr(server_module, "MAX_CONNECTIONS", 1 + len(UNFINISHED))
+        writers = await begin(2 * UNFINISHED)
+        await asyncio.wait_for(asyncio.gather(*ends[len(UNFINISHED) :]), WAIT_S)
+        await page.until(lambda state: True)
+        assert not any(task.done() for task in ends[: len(UNFINISHED)])
+        monkeypatch.setattr(server_module, "MAX_CONNECTIONS", 64)
+        monkeypatch.setattr(server_module, "MAX_REQUEST_S", 0.3)
+        ends.clear()
+        slow = await begin(UNFINISHED)
+        state, deadline = await page.until(lambda state: True), monotonic() + WAIT_S
+        while not all(task.done() for task in ends):
+            # The header and the body continue slowly.
+            for task, writer in list(zip(ends, slow, strict=True))[2:4]:
+                if not task.done():
+                    writer.write(b"a")
             await page.read()
-            assert monotonic() < time + WAIT_S
-        for reader, writer in opened:
-            await end(reader)
-            writer.close()
+            assert monotonic() < deadline
+        monkeypatch.setattr(server_module, "MAX_REQUEST_S", WAIT_S)
         assert await status(server.url) == 200
-        state = await page.until(lambda state: True)
-        await page.until(lambda later: later["time"] > state["time"] + 0.2)
-    message(lines, "7 connections")
+        await page.until(lambda later: later["time"] > state["time"] + 0.5)
+        for writer in (*writers, *slow):
+            writer.close()
+    message(lines, f"{1 + len(UNFINISHED)} connections")
 
 
 @scenario
@@ -466,9 +478,10 @@ def test_interruption_drops_queued_saves(session: Session, message: Messages, mo
         server = Server(session, listen(0), "small.yaml", warn=lines.append)
         running = asyncio.create_task(server.run(pause))
         client = await connect(server)
+        await client.until(lambda state: True)
         monkeypatch.setattr(Captures, "save_picture", save_picture)
         for _ in range(count):
-            client.connection.write_message('["key", "p"]')
+            server.receive(server.pages[0], '["key", "p"]')
         await running
 
     with pytest.raises(KeyboardInterrupt):
