@@ -501,6 +501,8 @@ def test_interruption_drops_queued_saves(session: Session, message: Messages, mo
         monkeypatch.setattr(Captures, "save_picture", save_picture)
         for _ in range(count):
             server.receive(server.pages[0], '["key", "p"]')
+        while {"ended": True} not in client.texts:
+            await client.read()
         await running
 
     with pytest.raises(KeyboardInterrupt):
