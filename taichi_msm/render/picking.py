@@ -55,7 +55,9 @@ def intersect_rest_plane(view: View, pixel: Pair) -> NDArray[np.floating] | None
     """
     matrix = view.centred_at(pixel).matrix
     planar = matrix[:2, :2]
-    if not abs(np.linalg.det(planar)) > 1e-9 * np.linalg.norm(planar, axis=1).prod():
+    # Outside of a lens's image the matrix is NaN.
+    is_finite = np.isfinite(planar).all()
+    if not is_finite or not abs(np.linalg.det(planar)) > 1e-9 * np.linalg.norm(planar, axis=1).prod():
         return None
     point = np.linalg.solve(planar, -matrix[:2, 3])
     return point if matrix[2] @ [*point, 0, 1] > view.near else None
