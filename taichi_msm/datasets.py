@@ -102,14 +102,7 @@ class _Split:
         return list(dict.fromkeys((width, height) for width, height in (run["size"] for run in self.runs)))
 
     def of_size(self, size: tuple[int, int]) -> Self:
-        """Return the part of this data set with frames of one size, for batches.
-
-        Args:
-            size: width and height of the frames [px], one of `sizes`.
-
-        Raises:
-            ArgumentError: when no run has frames of this size.
-        """
+        """Return the part of this data set with frames of one size, width and height [px], for batches."""
         if not isinstance(size, (tuple, list)) or tuple(size) not in self.sizes:
             raise ArgumentError(f"size: {size!r}; take one of {', '.join(map(str, self.sizes))}")
         part = copy(self)
@@ -117,15 +110,7 @@ class _Split:
         return part
 
     def loader(self, **options: Any) -> Any:
-        """Return a `torch.utils.data.DataLoader` of this data set.
-
-        Args:
-            **options: keyword arguments of `DataLoader`, such as batch_size, shuffle and num_workers.
-
-        Raises:
-            ArgumentError: when the frames have several sizes, and batches are of more than one item.
-            NotInstalledError: when PyTorch is not installed.
-        """
+        """Return a `torch.utils.data.DataLoader` of this data set; `options` are its arguments, such as batch_size."""
         is_batched = options.get("batch_size") not in (None, 1) and "collate_fn" not in options
         if is_batched and len(self.sizes) > 1:
             sizes = ", ".join(map(str, self.sizes))

@@ -23,15 +23,11 @@ Key = tuple[str | int, ...]
 
 @dataclass(frozen=True)
 class Problem:
-    """A fault of a scene.
+    """A fault of a scene."""
 
-    Attributes:
-        path: path to the faulty key; empty for the whole scene.
-        message: value, fault and remedy, without the key.
-    """
-
-    path: Key
-    message: str
+    path: Key  # to the faulty key; empty for the whole scene
+    message: str  # value, fault and remedy, without the key
+    is_unknown_key: bool = False  # whether the section has no such key
 
     @property
     def key(self) -> str:
@@ -109,15 +105,7 @@ class ForeignError(FilesError):
 
     @classmethod
     def at(cls, path: object, kind: str) -> ForeignError:
-        """Build the error for a path.
-
-        Args:
-            path: path of the foreign file or folder.
-            kind: noun for the message, such as "a file"; see `directory.entry_kind`.
-
-        Returns:
-            The error, to be raised.
-        """
+        """Build the error for a path; `kind` is a noun for the message, as from `directory.entry_kind`."""
         return cls(f"{path}: {kind} not written by this program; move it away or choose another folder")
 
 
@@ -140,12 +128,7 @@ def truncate(text: str) -> str:
 
 
 def did_you_mean(name: str, known: Iterable[str]) -> str:
-    """Return a hint for the message of an unknown name, such as "; did you mean 'top'?"; empty without a similar name.
-
-    Args:
-        name: unknown name; case is ignored.
-        known: valid names.
-    """
+    """Return a hint for an unknown name in any case, such as "; did you mean 'top'?"; empty without a similar name."""
     # Imported here, as only a message needs it.
     from difflib import get_close_matches
 
@@ -156,15 +139,7 @@ def did_you_mean(name: str, known: Iterable[str]) -> str:
 
 @contextmanager
 def writing(path: object, option: str = "--out") -> Iterator[None]:
-    """Return a context that converts an OSError to a FilesError.
-
-    Args:
-        path: file or folder that the block writes to, for the message.
-        option: command-line option of the path, for the remedy.
-
-    Raises:
-        FilesError: in place of the OSError, with its reason and the remedy.
-    """
+    """Return a context that converts an OSError to a FilesError, whose remedy is another path for `option`."""
     try:
         yield
     except OSError as error:
@@ -186,23 +161,12 @@ def out_of_memory(error: Exception) -> str:
     return ""
 
 
-# Largest number of processes or threads.
+# Largest number of processes or threads, above the cores of any machine; Taichi starts all of its threads.
 MAX_WORKERS = 1024
 
 
 def as_array(values: Any, name: str) -> NDArray[Any]:
-    """Convert an argument of a library call to an array.
-
-    Args:
-        values: array or nested sequences.
-        name: name of the argument, for the message.
-
-    Returns:
-        An array of any shape and dtype; not copied if `values` is one.
-
-    Raises:
-        ArgumentError: when conversion fails, such as for rows of different lengths.
-    """
+    """Convert an argument to an array, not copied if it is one; raise an ArgumentError where that is impossible."""
     # Imported here, so that the check of a scene does not import NumPy.
     import numpy as np
 
@@ -213,27 +177,12 @@ def as_array(values: Any, name: str) -> NDArray[Any]:
 
 
 def is_real_array(array: NDArray[Any], shape: tuple[int, ...]) -> bool:
-    """Return whether an array has an integer or floating dtype and a given shape.
-
-    Args:
-        array: array of any dtype.
-        shape: expected shape; a 1 does not broadcast.
-    """
+    """Return whether an array has an integer or floating dtype and a given shape, in which a 1 does not broadcast."""
     return array.dtype.kind in "fiu" and array.shape == shape
 
 
 def require_type(value: Any, types: Any, name: str, expected: str) -> None:
-    """Raise an ArgumentError unless an argument of a library call has one of some types.
-
-    Args:
-        value: argument of any type.
-        types: type or types, as for `isinstance`.
-        name: its name in the message.
-        expected: allowed values, for the message.
-
-    Raises:
-        ArgumentError: when the argument has another type.
-    """
+    """Raise an ArgumentError unless an argument has one of some types; `expected` are its values, for the message."""
     if not isinstance(value, types):
         raise ArgumentError(f"{name}: {value!r}; take {expected}")
 
@@ -245,16 +194,7 @@ def require_frame_count(frames: int) -> None:
 
 
 def require_path(path: str | Path, name: str = "directory", remedy: str = "take a path") -> None:
-    """Raise an ArgumentError unless an argument of a library call is a path.
-
-    Args:
-        path: argument of any type.
-        name: its name in the message.
-        remedy: advice at the end of the message.
-
-    Raises:
-        ArgumentError: when the argument is neither a text nor a Path, or contains a null character.
-    """
+    """Raise an ArgumentError unless an argument is a text or a Path without a null character."""
     if not isinstance(path, (str, Path)) or "\0" in str(path):
         raise ArgumentError(f"{name}: {path!r}; {remedy}")
 

@@ -35,7 +35,14 @@ _copies: Mapping[str, Path] = {}
 
 
 class PictureError(Exception):
-    """A file cannot be used as a picture; the message contains the reason and the remedy."""
+    """A file cannot be used as a picture."""
+
+    def __init__(self, fault: str, remedy: str) -> None:
+        super().__init__(fault, remedy)
+        self.fault = fault
+
+    def __str__(self) -> str:
+        return "; ".join(self.args)
 
 
 @contextmanager
@@ -50,18 +57,9 @@ def use_copies(copies: Mapping[str, Path]) -> Iterator[None]:
 
 
 def read_rgb(path: str, background: tuple[int, int, int], sha256: str | None = None) -> Image.Image:
-    """Read the first picture of a file as 8-bit sRGB, in its upright orientation.
+    """Read the first picture of a file, upright, as 8-bit sRGB, with `background` behind transparent pixels.
 
-    Args:
-        path: path of the file.
-        background: colour behind transparent pixels.
-        sha256: required SHA-256 of the file, in hexadecimal; None for any.
-
-    Returns:
-        The picture, converted from the file's colour profile to sRGB.
-
-    Raises:
-        PictureError: when the file cannot be used or has another SHA-256.
+    If the file has another SHA-256 than `sha256`, in hexadecimal, it is an error.
     """
     from PIL import ImageOps
 
@@ -71,19 +69,10 @@ def read_rgb(path: str, background: tuple[int, int, int], sha256: str | None = N
 
 
 def read_grey(path: str, sha256: str | None = None) -> NDArray[Any]:
-    """Read the grey values of a picture, in its upright orientation.
+    """Read the grey values of an upright picture, shape (height, width): uint16 for a file of 16 bits, else uint8.
 
-    Grey values are data, not colours: the colour profile is ignored. Transparent pixels are black.
-
-    Args:
-        path: path of the file.
-        sha256: required SHA-256 of the file, in hexadecimal; None for any.
-
-    Returns:
-        Grey values, shape (height, width), as uint16 for a file of 16 bits, otherwise as uint8.
-
-    Raises:
-        PictureError: when the file cannot be used or has another SHA-256.
+    Grey values are data, not colours: the colour profile is ignored. Transparent pixels are black. `sha256` is as for
+    `read_rgb`.
     """
     import numpy as np
     from PIL import ImageOps
@@ -137,33 +126,34 @@ def _open(path: str, sha256: str | None = None) -> Iterator[Image.Image]:
             with ExitStack() as opened:
                 file = opened.enter_context(actual_path(path).open("rb"))
                 if sha256 is not None and _sha256(file) != sha256:
-                    raise PictureError(f"{path} differs from the file of the run (SHA-256); restore the original file")
+                    fault = f"{path} differs from the file of the run (SHA-256)"
+                    raise PictureError(fault, "restore the original file")
                 file.seek(0)
                 image = opened.enter_context(Image.open(file, formats=PICTURE_FORMATS))
                 if max(image.size) > MAX_SIDE_PX:
-                    reason = f"has {image.width} x {image.height} pixels; crop it to at most {MAX_SIDE_PX} a side"
-                    raise PictureError(f"{path} {reason}")
+                    fault = f"{path} has {image.width} x {image.height} pixels"
+                    raise PictureError(fault, f"crop it to at most {MAX_SIDE_PX} a side")
                 if image.format in ("JPEG", "MPO"):
                     scans = _count_scans(file)
                     # A scan is a pass over the picture, and encoders write about ten. More are allowed up to 200
                     # million pixels in all, which take a few seconds.
                     limit = max(16, 200_000_000 // (image.width * image.height))
                     if scans > limit:
-                        raise PictureError(f"{path} has {scans} scans, more than {limit}; save it again")
+                        raise PictureError(f"{path} has {scans} scans, more than {limit}", "save it again")
                 if image.mode not in _MODES:
-                    raise PictureError(f"{path} has pixels of kind {image.mode}; save it as 8-bit RGB")
+                    raise PictureError(f"{path} has pixels of kind {image.mode}", "save it as 8-bit RGB")
                 yield image
         except PictureError:
             raise
         except UnidentifiedImageError:
-            raise PictureError(f"{path} is not a PNG, JPEG, WebP, BMP or TIFF picture; convert it") from None
+            raise PictureError(f"{path} is not a PNG, JPEG, WebP, BMP or TIFF picture", "convert it") from None
         except (Image.DecompressionBombWarning, Image.DecompressionBombError):
             limit = (Image.MAX_IMAGE_PIXELS or 0) // 10**6
-            raise PictureError(f"{path} has more than {limit} million pixels; scale it down") from None
+            raise PictureError(f"{path} has more than {limit} million pixels", "scale it down") from None
         except PermissionError:
-            raise PictureError(f"{path} may not be read; change its permissions") from None
+            raise PictureError(f"{path} may not be read", "change its permissions") from None
         except Exception as error:
-            raise PictureError(f"{path} cannot be decoded ({error}); save it again") from None
+            raise PictureError(f"{path} cannot be decoded ({error})", "save it again") from None
 
 
 def _sha256(file: BinaryIO) -> str:
@@ -191,10 +181,7 @@ def _count_scans(file: BinaryIO) -> int:
 
 
 def irregular_kind(path: Path) -> str:
-    """Return the kind of a path that is not a regular file; empty for a regular file.
-
-    The path is not opened: a pipe would block.
-    """
+    """Return the kind of a path that is no regular file, else ""; the path is not opened, as a pipe would block."""
     mode = path.stat().st_mode
     if stat.S_ISREG(mode):
         return ""
@@ -210,17 +197,17 @@ def _require_file(path: str) -> None:
     try:
         kind = irregular_kind(actual_path(path))
     except ValueError:
-        raise PictureError(f"{path} is not a path; name a picture") from None
+        raise PictureError(f"{path} is not a path", "name a picture") from None
     except OSError as error:
         raise _unreadable(path, error) from None
     if kind:
-        raise PictureError(f"{path} is {kind}; name a picture")
+        raise PictureError(f"{path} is {kind}", "name a picture")
     if actual_path(path).stat().st_size > MAX_BYTES:
-        raise PictureError(f"{path} is larger than {MAX_BYTES >> 30} GiB; scale it down")
+        raise PictureError(f"{path} is larger than {MAX_BYTES >> 30} GiB", "scale it down")
 
 
 def _unreadable(path: str, error: OSError) -> PictureError:
-    return PictureError(f"{path}: {(error.strerror or str(error)).lower()}; name a picture that can be read")
+    return PictureError(f"{path}: {(error.strerror or str(error)).lower()}", "name a picture that can be read")
 
 
 def _to_8_bit(image: Image.Image) -> Image.Image:
@@ -249,13 +236,12 @@ def _to_srgb(path: str, image: Image.Image, profile: bytes | None) -> Image.Imag
         mode = {"GRAY": "L", "CMYK": "CMYK"}.get(space, "RGB")
         valid_modes = {"L": ("1", "L", "LA"), "CMYK": ("CMYK",)}.get(mode, tuple(m for m in _MODES if m != "CMYK"))
         if image.mode not in valid_modes:
-            raise PictureError(
-                f"{path} has pixels of kind {image.mode} and a colour profile of {space}; save it as sRGB"
-            )
+            fault = f"{path} has pixels of kind {image.mode} and a colour profile of {space}"
+            raise PictureError(fault, "save it as sRGB")
         transform = ImageCms.buildTransform(source, ImageCms.createProfile("sRGB"), mode, "RGB")
     except (OSError, ImageCms.PyCMSError) as error:
         reason = str(error).strip() or "unknown"
-        raise PictureError(f"{path} has a colour profile that cannot be used ({reason}); save it as sRGB") from None
+        raise PictureError(f"{path} has a colour profile that cannot be used ({reason})", "save it as sRGB") from None
     if mode == "RGB" and _is_identity(transform):
         return image
     transparent = image.convert("RGBA") if image.has_transparency_data else None

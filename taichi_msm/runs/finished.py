@@ -50,14 +50,7 @@ class FinishedRun:
         return np.arange(self.frames) / self.scene.time.frames_per_second
 
     def positions(self) -> NDArray[np.floating]:
-        """Map the trajectory into memory.
-
-        Returns:
-            Positions of the mass points [m], shape (frames, rows, cols, 3), read-only.
-
-        Raises:
-            FilesError: when the trajectory is missing or damaged, or does not fit the scene.
-        """
+        """Map the positions of the mass points [m], shape (frames, rows, cols, 3), into memory, read-only."""
         path = self.result_path("trajectory")
         dtype = np.dtype(np.float32 if self.scene.time.precision == "f32" else np.float64)
         rest = rest_positions(self.scene.sheet)
@@ -73,18 +66,7 @@ class FinishedRun:
         return positions
 
     def read_picture(self, key: str, frame: int) -> NDArray[np.uint8]:
-        """Read the picture of a frame.
-
-        Args:
-            key: entry of `output`, such as "png".
-            frame: index, from 0.
-
-        Returns:
-            Colours, shape (height, width, 3).
-
-        Raises:
-            FilesError: when the picture is missing, cannot be decoded or has the wrong size.
-        """
+        """Read the picture of a frame, shape (height, width, 3), of an entry of `output` such as "png"."""
         path = self.result_path(key, frame)
         try:
             image = read_rgb(str(path), (0, 0, 0))
@@ -122,7 +104,7 @@ class FinishedRun:
                 if file_sha256(path) == self.sha256.get(key):
                     continue
             except PictureError as error:
-                fault = str(error).partition(";")[0]
+                fault = error.fault
             raise FilesError(f"{self.directory}: {key}: {fault}; {RESTORE_PICTURE}")
 
     def has_output(self, key: str) -> bool:
@@ -146,15 +128,7 @@ class FinishedRun:
         return f'run the scene again with --set "output=[{outputs}]"'
 
     def result_path(self, key: str, frame: int = 0) -> Path:
-        """Return the path of the file that an entry of `output` wrote.
-
-        Args:
-            key: entry of `output`.
-            frame: index, from 0; ignored for entries with one file for all frames.
-
-        Raises:
-            FilesError: when the file is missing or is not a regular file of the run.
-        """
+        """Return the path of a file of an entry of `output`, for a series that of a frame; a FilesError without it."""
         result, folder = OUTPUTS[key].result, self._output_folder(key)
         path = folder / OUTPUTS[key].path(frame)
         if not self.has_output(key):
@@ -162,17 +136,10 @@ class FinishedRun:
         return self.require_regular_file(path, key)
 
     def require_regular_file(self, path: Path, key: str) -> Path:
-        """Require a regular file without symbolic links on its path, which could expose other files.
+        """Return a path below the run's folder; raise a FilesError unless it is a regular file.
 
-        Args:
-            path: path below the run's folder.
-            key: entry of `output` that writes the file, for the remedy.
-
-        Returns:
-            The path.
-
-        Raises:
-            FilesError: when the file is missing, or an entry on the path is of another kind.
+        Links on the path, which could expose other files, are not allowed. `key` is the entry of `output`, for the
+        remedy.
         """
         relative = path.relative_to(self.directory)
         for inner in [*reversed(relative.parents), relative][1:]:  # without the run's folder itself
@@ -187,12 +154,7 @@ class FinishedRun:
 
 
 def read_run(directory: str | Path) -> FinishedRun:
-    """Read the record of a finished run, run.json; other results are read on demand.
-
-    Raises:
-        ArgumentError: when the directory is not a path.
-        FilesError: when the record is missing or invalid.
-    """
+    """Read the record of a finished run, run.json; other results are read on demand."""
     require_path(directory)
     path = Path(directory) / RUN_RECORD
     with reading(path):

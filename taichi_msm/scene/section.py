@@ -29,12 +29,7 @@ SCENE_FAULT = "refused"
 
 
 def scene_fault(message: str, *below: str | int) -> PydanticCustomError:
-    """Return the error that a validator raises for its value.
-
-    Args:
-        message: fault and remedy.
-        below: path within the validated value to the faulty one; empty for the validated value itself.
-    """
+    """Return the error that a validator raises for its value, or for the one at the path `below` within it."""
     return PydanticCustomError(SCENE_FAULT, message, {"below": below})
 
 
@@ -55,20 +50,14 @@ def format_value(value: Any) -> str:
 
 
 def key_problems(error: ValidationError, section: type[BaseModel], data: Any) -> list[Problem]:
-    """Convert pydantic's errors to problems, each at a key of the scene.
-
-    Args:
-        error: errors of the validation.
-        section: model of the data.
-        data: the validated values, of plain Python types.
-
-    Returns:
-        Problems in the order of the errors, without duplicates at lists and unions.
-    """
+    """Convert pydantic's errors to problems at keys of the scene, without duplicates at lists and unions."""
     # A broken file of the largest size could have tens of thousands of faults.
     errors = error.errors(include_url=False, include_input=False)[:1000]
     faults = [_locate(details, section) for details in errors]
-    return [Problem(fault.path, _message(fault, data)) for fault in _merge_missing_items(_choose_members(faults))]
+    return [
+        Problem(fault.path, _message(fault, data), is_unknown_key=fault.kind == "extra_forbidden")
+        for fault in _merge_missing_items(_choose_members(faults))
+    ]
 
 
 class _Fault(NamedTuple):
@@ -225,13 +214,7 @@ SheetFraction = Annotated[Number, Field(ge=MIN_FRACTION, le=MAX_FRACTION)]
 
 
 def key(default: Any, description: str, expects: str) -> Any:
-    """Return the declaration of a key of a section.
-
-    Args:
-        default: default value; ... for a required key.
-        description: meaning and unit, for the documentation and the schema.
-        expects: allowed values, for messages after "expected".
-    """
+    """Return the declaration of a key, required if the default is ...; messages have `expects` after "expected"."""
     return Field(default, description=description, json_schema_extra={"expects": expects})
 
 
@@ -269,16 +252,7 @@ class Section(BaseModel, metaclass=_SectionMeta):
     model_config = ConfigDict(frozen=True, extra="forbid", validate_default=True)
 
     def model_copy(self, *, update: Mapping[str, Any] | None = None, deep: bool = False) -> Self:
-        """Return a copy of the section.
-
-        Args:
-            update: new values by keys; None for an equal copy.
-            deep: ignored, as the values are immutable.
-
-        Raises:
-            ArgumentError: when `update` is not a mapping from names of keys.
-            SceneError: when a key is unknown or a value invalid.
-        """
+        """Return a copy with new values by key, which are validated; `deep` is ignored, as values are immutable."""
         del deep
         if not (update is None or (isinstance(update, Mapping) and all(isinstance(name, str) for name in update))):
             raise ArgumentError(f"update: {update!r}; take a mapping from keys to values")

@@ -13,6 +13,7 @@ import pytest
 from PIL import Image
 
 from taichi_msm.errors import SceneError, printable
+from taichi_msm.load.check import parse_model
 from taichi_msm.load.scene_file import MAX_LINES, load_scene, parse_override, schema
 from taichi_msm.scene.scene import Scene
 from tests.golden import Messages
@@ -340,6 +341,11 @@ def test_errors_in_overrides(load: Load, overrides: Any, place: str, message: Me
     (line,) = str(caught.value).splitlines()
     last = f"--set {overrides[-1]}: {place}" if isinstance(overrides, list) else f"override {next(iter(overrides))}"
     assert line.startswith(printable(last))
+
+
+def test_unknown_keys_are_marked() -> None:
+    _, problems = parse_model(Scene, {"sheet": {"points": 3, "mas": 1}, "time": {"duration": 0}, "dampign": 0})
+    assert [problem.key for problem in problems if problem.is_unknown_key] == ["sheet.mas", "dampign"]
 
 
 def test_parsed_overrides() -> None:

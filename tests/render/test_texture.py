@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import os
+import pickle
 import warnings
 from pathlib import Path
 from typing import Any
@@ -14,7 +15,7 @@ from numpy.typing import NDArray
 from PIL import Image, ImageCms
 
 from taichi_msm.errors import SceneError
-from taichi_msm.images import read_grey
+from taichi_msm.images import PictureError, file_sha256, read_grey
 from taichi_msm.render.texture import image_problems, image_size, load_texture
 from taichi_msm.scene.scene import Scene
 from tests import scenes
@@ -241,6 +242,13 @@ def test_unreadable_picture(monkeypatch: pytest.MonkeyPatch, message: Messages) 
     Image.fromarray(COLOURS).save("secret.png")
     monkeypatch.setattr(Image, "open", forbidden)
     assert_refused(message, "secret.png")
+
+
+def test_fault_of_a_picture_with_a_semicolon_in_its_name() -> None:
+    with pytest.raises(PictureError) as caught:
+        file_sha256("a; b.png")
+    assert caught.value.fault == "a; b.png: no such file or directory"
+    assert str(pickle.loads(pickle.dumps(caught.value))) == f"{caught.value.fault}; name a picture that can be read"
 
 
 def test_control_sequences_in_a_name(message: Messages) -> None:
