@@ -27,12 +27,7 @@ class Calibration(NamedTuple):
     right: StereoPose | None = None  # pose, of the right camera of a stereo pair only
 
     def scaled(self, scale_x: float, scale_y: float) -> Calibration:
-        """Return the calibration for pictures resized edge to edge.
-
-        Args:
-            scale_x: new width over old width.
-            scale_y: new height over old height.
-        """
+        """Return the calibration for pictures resized edge to edge, by factors of their width and height."""
         (cx, cy), lens = self.centre, dict(self.coefficients)
         focal = None if self.focal is None else (self.focal[0] * scale_x, self.focal[1] * scale_y)
         if self.model == "scaramuzza":
@@ -46,15 +41,11 @@ class Calibration(NamedTuple):
 
 
 def focal_fault(focal: Sequence[float], size: Sequence[float]) -> str:
-    """Return fault and remedy of focal lengths that are too short to be in pixels; "" for plausible ones.
+    """Return fault and remedy of focal lengths fx, fy [px] too short for a picture size [px]; "" for plausible ones.
 
     The limit is a twentieth of the picture. At the limit, a perspective camera has a field of view of 168 degrees (the
     widest lenses have 140), and the image circle of a 360-degree equidistant fisheye, of diameter 2 pi f, fills less
     than a third of the picture. Focal lengths in millimetres or in picture widths are below the limit.
-
-    Args:
-        focal: focal lengths fx, fy [px].
-        size: width and height of the pictures [px].
     """
     for name, extent, length, pixels in zip(("fx", "fy"), ("width", "height"), focal, size, strict=True):
         if length < pixels / 20:

@@ -33,12 +33,7 @@ _PARSER_ERRORS = (
 
 
 class Entries(dict[str, Any]):
-    """Keys and values of a file, or of one of its sections.
-
-    Args:
-        values: values by keys.
-        lines: line numbers by keys, from 1; empty for JSON and XML, whose parsers have no lines.
-    """
+    """Keys and values of a file or a section, with line numbers, from 1, of its keys; empty for JSON and XML."""
 
     def __init__(self, values: Mapping[str, Any], lines: Mapping[str, int]) -> None:
         super().__init__(values)
@@ -58,27 +53,14 @@ class _ContentError(Exception):
 
 
 class CameraFile:
-    """Text file with a calibration or a trajectory of a camera.
-
-    Args:
-        path: path of the file.
-        max_bytes: largest size of the file.
-
-    Raises:
-        CameraFileError: when the file cannot be read.
-    """
+    """Text file with a calibration or a trajectory of a camera; a CameraFileError if it cannot be read."""
 
     def __init__(self, path: str, max_bytes: int) -> None:
         self.path = path
         self.text = _read(path, max_bytes)
 
     def fault(self, fault: str, line: int | None = None) -> CameraFileError:
-        """Return an error for the caller to raise.
-
-        Args:
-            fault: reason and remedy.
-            line: number of the line, counted from 1; None where it is unknown.
-        """
+        """Return an error, for the caller to raise, with the number of the line, from 1, where it is known."""
         return CameraFileError(f"{self.path}{'' if line is None else f':{line}'}: {fault}")
 
     @cached_property
@@ -88,11 +70,7 @@ class CameraFile:
 
     @cached_property
     def data(self) -> Entries:
-        """Keys and values of YAML, JSON, XML or an ini file.
-
-        Raises:
-            CameraFileError: when the file has another format.
-        """
+        """Keys and values of YAML, JSON, XML or an ini file; a CameraFileError for another format."""
         try:
             data = _parse(self.text)
         except _ContentError as error:

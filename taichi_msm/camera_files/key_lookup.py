@@ -19,14 +19,7 @@ ROUNDING_TOLERANCE = 1e-6
 
 
 class Keys:
-    """Keys of one camera in a calibration.
-
-    Args:
-        file: file of the calibration.
-        data: values by name in the file.
-        folded: folded names without the mark of the camera (left, 1, ...), by name in the file; by default with it.
-        lines: line numbers by name in the file, for messages; by default those of `data`.
-    """
+    """Keys of one camera in a calibration."""
 
     def __init__(
         self,
@@ -36,7 +29,8 @@ class Keys:
         lines: Mapping[str, int] | None = None,
     ) -> None:
         self.file = file
-        self.data = data
+        self.data = data  # values by name in the file
+        # Folded names without the mark of the camera (left, 1, ...), by default with it; line numbers, for messages.
         self.folded = {name: fold(name) for name in data} if folded is None else folded
         self.lines = (data.lines if isinstance(data, Entries) else {}) if lines is None else lines
         self._read_names: set[str] = set()
@@ -45,21 +39,11 @@ class Keys:
         return listed(self.data)
 
     def fault(self, fault: str, name: str | None) -> CameraFileError:
-        """Return an error for the caller to raise.
-
-        Args:
-            fault: reason and remedy.
-            name: key at fault, whose line is in the message; None for the file as a whole.
-        """
+        """Return an error, for the caller to raise, with the line of the key `name`; None for the file as a whole."""
         return self.file.fault(fault, None if name is None else self.lines.get(name))
 
     def values(self, spelling: str, kind: type = object) -> dict[str, Any]:
-        """Return the non-empty values of the keys that match a spelling, by name in the file.
-
-        Args:
-            spelling: pattern of the folded name.
-            kind: type of the values.
-        """
+        """Return the non-empty values of a type, by name in the file, whose folded names match a spelling (pattern)."""
         names = [name for name, value in self.data.items() if isinstance(value, kind)]
         matches = {name: self.data[name] for name in names if re.fullmatch(spelling, self.folded[name])}
         self._read_names |= matches.keys()
@@ -82,16 +66,7 @@ class Keys:
         return numbers
 
     def require(self, spelling: str, count: int, name: str) -> list[float]:
-        """Return the numbers of a required key.
-
-        Args:
-            spelling: pattern of the folded name.
-            count: length of the list.
-            name: name of the key for messages.
-
-        Raises:
-            CameraFileError: when the key is missing or its list has another length.
-        """
+        """Return the numbers of a required key, whose name in messages is `name`."""
         numbers = self.numbers(spelling)
         if numbers is None:
             raise self.file.fault(f"has no {name}; found {self}; add it")

@@ -34,18 +34,9 @@ TIME_UNITS = {"s": 1.0, "ms": 1e3, "us": 1e6, "ns": 1e9}
 def read_calibration(
     path: str, eye: Literal["left", "right"] = "left", unit: Literal["m", "mm"] | None = None
 ) -> Calibration:
-    """Read a calibration.
+    """Read a calibration, lengths in metres; that of the right camera of a stereo pair has its pose.
 
-    Args:
-        path: path of the file.
-        eye: camera of a stereo pair; right includes its pose.
-        unit: unit of lengths in the file; by default that of the format, or metres if the format has none.
-
-    Returns:
-        The calibration, lengths in metres.
-
-    Raises:
-        CameraFileError: when the file is invalid or not supported; the message lists the keys of the file.
+    `unit` is that of lengths in the file; by default that of the format, or metres if the format has none.
     """
     file = CameraFile(path, max_bytes=2**22)
     reader, cameras = next((reader, cameras) for reader in CALIBRATION_READERS if (cameras := reader.cameras(file)))
@@ -80,18 +71,7 @@ class PoseKeys(NamedTuple):
 
 
 def read_poses(path: str, keys: PoseKeys = PoseKeys()) -> tuple[tuple[float, ...], ...]:  # noqa: B008
-    """Read a trajectory.
-
-    Args:
-        path: path of the file.
-        keys: keys of the camera that describe the file.
-
-    Returns:
-        Rows of time [s], position x, y, z [m] and quaternion x, y, z, w, from the camera to the world.
-
-    Raises:
-        CameraFileError: when the file is invalid or not supported; the message contains the line.
-    """
+    """Read a trajectory: rows of time [s], position x, y, z [m] and quaternion x, y, z, w, from camera to world."""
     file = CameraFile(path, max_bytes=2**27)  # COLMAP's files contain the points of every picture
     trajectory = next(found for reader in TRAJECTORY_READERS if (found := reader.read(file)) is not None)
     if not trajectory.rows:

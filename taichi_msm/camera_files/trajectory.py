@@ -48,11 +48,9 @@ def parse_numbers(words: Sequence[str]) -> list[float] | None:
 
 
 def pose_fault(row: Sequence[float], previous: Sequence[float] | None) -> str:
-    """Return the fault of a pose and its remedy; "" if there is none.
+    """Return fault and remedy of a row of time [s], position [m] and quaternion x, y, z, w; "" for a valid one.
 
-    Args:
-        row: time [s], position x, y, z [m], quaternion x, y, z, w.
-        previous: row before it, for the order of times; None for the first.
+    The previous row is for the order of times; None for the first.
     """
     if previous is not None and row[0] <= previous[0]:
         times = f"is at {row[0]:.15g} s, not after the previous pose at {previous[0]:.15g} s"
