@@ -56,12 +56,7 @@ def validate(data: dict[str, Any]) -> tuple[Plan | None, list[Problem]]:
 
 
 def value_at(data: Any, key: Key) -> Any:
-    """Return the value at a key of unvalidated data; None for a missing key.
-
-    Args:
-        data: plain data, as parsed from YAML.
-        key: path to the value, through mappings only.
-    """
+    """Return the value at a key of unvalidated data, through mappings only; None for a missing key."""
     for part in key:
         data = data.get(part) if isinstance(data, dict) else None
     return data
@@ -89,18 +84,10 @@ def _check_combinations(
 
 
 def check_scene(scene: Plan | Scene | Mapping[str, Any], maps: Maps | None = None) -> Plan:
-    """Validate a scene, and plan it for a CPU.
+    """Validate a scene, except for the image file of a `Scene`, and plan it for a CPU; a plan is returned unchanged.
 
-    Args:
-        scene: a `Scene`, except for its image file; a mapping with its keys; or a plan, which is returned unchanged.
-        maps: images of the scene's maps, by key; None reads them from their files.
-
-    Returns:
-        The plan, whose `scene` is the validated scene.
-
-    Raises:
-        ArgumentError: when `scene` has another type.
-        SceneError: when the scene is invalid; contains all problems.
+    `maps` are the images of the scene's maps, by key; None reads them from their files. A SceneError contains all
+    problems.
     """
     if isinstance(scene, Plan):
         return scene
@@ -137,15 +124,7 @@ def _replace_faulty(data: dict[str, Any], problems: list[Problem]) -> dict[str, 
 
 
 def parse_model(model: type[Model], data: dict[str, Any]) -> tuple[Model | None, list[Problem]]:
-    """Validate the keys of a section separately.
-
-    Args:
-        model: class of the section.
-        data: values by key, as parsed from YAML.
-
-    Returns:
-        The section and no problems, or None and a problem for each faulty key.
-    """
+    """Validate the keys of a section separately; return it without problems, or None and one for each faulty key."""
     try:
         return model.model_validate(data), []
     except ValidationError as error:

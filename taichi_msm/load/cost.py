@@ -158,15 +158,7 @@ def size_problems(plan: Plan) -> Iterator[Problem]:
 
 
 def require_disk(plan: Plan, directory: Path) -> None:
-    """Require that a disk has enough free space for a run.
-
-    Args:
-        plan: plan of the run; determines the files.
-        directory: destination of the results; may be missing.
-
-    Raises:
-        SceneError: when an upper bound of the files exceeds the free space; names the key with the largest share.
-    """
+    """Raise a SceneError, at the key with the largest share, if the files of a run may exceed the free disk space."""
     scene, budget, free = plan.scene, estimate_budget(plan), _free_disk(directory)
     needed = budget.disk_bytes + budget.working_bytes
     if needed <= free:

@@ -26,19 +26,7 @@ class ResolvedPlan(NamedTuple):
 
 
 def resolve(plan: Plan, device: Device, progress: ProgressCallback = lambda done, total: None) -> ResolvedPlan:
-    """Choose the open settings of a scene; for a scene with tolerances, by trial runs.
-
-    Args:
-        plan: plan of a valid scene, checked for a CPU.
-        device: device of the run and of the trial runs.
-        progress: called with the completed and the total work of the trial runs.
-
-    Returns:
-        The plan with a frozen grid, and the error estimates of the trial runs.
-
-    Raises:
-        SceneError: when a tolerance cannot be met, or the precision of the device does not suffice.
-    """
+    """Choose the open settings of a scene; for a scene with tolerances, by trial runs."""
     estimate = mesh = None
     plan = planning.choose_precision(plan, device.arch)
     # The plan was checked for a CPU, where `auto` may choose another precision.

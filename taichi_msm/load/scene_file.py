@@ -89,20 +89,7 @@ def load_scene(
 def load_plan(
     path: str | Path, overrides: Sequence[str] | Mapping[str, Any] = (), image: str | Path | None = None
 ) -> Plan:
-    """Read and validate a scene file, and plan the scene for a CPU.
-
-    Args:
-        path: as for `load_scene`.
-        overrides: as for `load_scene`.
-        image: as for `load_scene`.
-
-    Returns:
-        The plan, with the SHA-256 of the files of cameras.
-
-    Raises:
-        ArgumentError: as for `load_scene`, or when `path` is a mapping.
-        SceneError: as for `load_scene`.
-    """
+    """Read and validate a scene file as `load_scene`, and plan the scene for a CPU."""
     if isinstance(path, Mapping):
         raise ArgumentError("path: a mapping; take the path of a scene file, or build Scene(**mapping)")
     return plan_file(read_file(str(path), SCENE_KIND), overrides, image)
@@ -111,20 +98,7 @@ def load_plan(
 def plan_file(
     file: ParsedFile, overrides: Sequence[str] | Mapping[str, Any] = (), image: str | Path | None = None
 ) -> Plan:
-    """Validate a parsed scene file, and plan the scene for a CPU.
-
-    Args:
-        file: scene file from `read_file`.
-        overrides: as for `load_scene`.
-        image: as for `load_scene`.
-
-    Returns:
-        The plan, with the SHA-256 of the files of cameras.
-
-    Raises:
-        ArgumentError: as for `load_scene`.
-        SceneError: as for `load_scene`, or when the file is a sweep.
-    """
+    """Validate a parsed scene file as `load_scene`, and plan the scene for a CPU, with the SHA-256 of camera files."""
     if isinstance(overrides, str) or not (
         isinstance(overrides, (Sequence, Mapping)) and all(isinstance(item, str) for item in overrides)
     ):
@@ -244,13 +218,9 @@ class Draft:
             self.problems.append((origin, problem))
 
     def resolve_path(self, key: Key, folder: Path) -> None:
-        """Rewrite a path in the file to be relative to the current directory.
+        """Rewrite a path in the file, relative to its folder, to be relative to the current directory.
 
         A path outside the folder, unless from an override, and a missing camera file are recorded as problems.
-
-        Args:
-            key: key of the path; a value other than a text is left to validation.
-            folder: folder of the scene file, to which the path is relative.
         """
         section, path = value_at(self.data, key[:-1]), value_at(self.data, key)
         if not (isinstance(path, str) and 0 < len(path) <= MAX_PATH):
@@ -330,12 +300,7 @@ class Draft:
 
 
 def is_below(path: Path, folder: Path) -> bool:
-    """Return whether a path, with symbolic links resolved, is inside a folder or the folder itself.
-
-    Args:
-        path: path relative to the current directory, possibly missing.
-        folder: path relative to the current directory.
-    """
+    """Return whether a path, with symbolic links resolved, is inside a folder or the folder itself."""
     try:
         return path.resolve().is_relative_to(folder.resolve())
     except (OSError, RuntimeError, ValueError):
@@ -344,18 +309,7 @@ def is_below(path: Path, folder: Path) -> bool:
 
 
 def read_file(name: str, kind: FileKind) -> ParsedFile:
-    """Read and parse a YAML file of an expected kind.
-
-    Args:
-        name: path of the file, relative to the current directory; also the name in messages.
-        kind: name and required keys of such a file, for messages.
-
-    Returns:
-        The parsed file, whose keys are not validated.
-
-    Raises:
-        SceneError: when the file cannot be read or does not contain a mapping.
-    """
+    """Read and parse a YAML file of an expected kind, which must contain a mapping."""
     try:
         document = read_yaml(_read_text(name, kind))
     except UnreadableError as error:

@@ -55,12 +55,7 @@ class Document(NamedTuple):
 
 
 class UnreadableError(Exception):
-    """The text is not YAML, or has too many values or too deep nesting.
-
-    Args:
-        mark: position of the fault.
-        message: the fault and the remedy, without the position.
-    """
+    """The text is not YAML, or has too many values or too deep nesting; the message has no position."""
 
     def __init__(self, mark: Mark, message: str) -> None:
         super().__init__(message)
@@ -82,12 +77,7 @@ def read_yaml(text: str) -> Document:
 
 
 def mark_at(text: str, index: int) -> Mark:
-    """Return the position of a character of a text.
-
-    Args:
-        text: the whole document.
-        index: index of the character, from 0.
-    """
+    """Return the position of the character at an index of a text."""
     before = text[:index]
     return Mark(before.count("\n") + 1, index - before.rfind("\n"))
 
