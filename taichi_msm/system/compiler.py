@@ -66,11 +66,7 @@ class Compiler:
         return Path(os.environ.get(self.folder_variable) or Path.home() / self.cache)
 
     def load(self) -> Any:
-        """Import the compiler, without its banner on stdout and its check for a newer version.
-
-        Raises:
-            NotInstalledError: when it cannot be imported.
-        """
+        """Import the compiler, without its banner on stdout and its check for a newer version."""
         if not os.environ.get("HOME"):
             # Taichi aborts the process if HOME is missing.
             os.environ.pop("HOME", None)
@@ -160,12 +156,7 @@ COMPILERS = {
 
 @cache
 def active_compiler() -> Compiler:
-    """Return the compiler that this process uses, without importing it.
-
-    Raises:
-        DeviceError: when the environment variable names an unknown compiler.
-        NotInstalledError: when the named compiler, or any compiler, is not installed.
-    """
+    """Return the compiler that this process uses, without importing it."""
     wanted = os.environ.get(COMPILER_VARIABLE)
     if wanted and wanted not in COMPILERS:
         hint = did_you_mean(wanted, list(COMPILERS))
@@ -189,12 +180,7 @@ def compiler_label(versions: Mapping[str, str]) -> str:
 
 
 def result_versions(versions: Mapping[str, str], arch: str) -> dict[str, str]:
-    """Return the versions that determine the bits of results: all except the version of a tested compiler on a CPU.
-
-    Args:
-        versions: as returned by `versions`.
-        arch: cpu, cuda or vulkan.
-    """
+    """Return the versions that determine the bits of results: all except that of a tested compiler on a CPU."""
     return {
         name: version
         for name, version in versions.items()

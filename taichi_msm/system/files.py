@@ -14,18 +14,9 @@ from pathlib import Path
 
 
 def read_regular(path: str | Path, limit: int) -> bytes:
-    """Read a regular file within a size limit, without blocking on a pipe or a device.
+    """Read a regular file of at most `limit` bytes, without blocking on a pipe or a device.
 
-    Args:
-        path: file or symbolic link to it.
-        limit: largest size [bytes].
-
-    Returns:
-        The content.
-
-    Raises:
-        OSError: when the file cannot be read, is not a regular file or exceeds the limit; `strerror` has the reason.
-        ValueError: when the path is invalid.
+    Other files raise an OSError, whose `strerror` has the reason, and invalid paths a ValueError.
     """
     # Opening a pipe would block, and opening some devices has side effects; Windows lacks these flags.
     flags = os.O_RDONLY | getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_NOCTTY", 0) | getattr(os, "O_BINARY", 0)

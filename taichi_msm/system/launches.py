@@ -33,9 +33,8 @@ PROOF_ROUNDS = 2
 class Launches:
     """Launches of the kernels of one picture or of one tracking query, with their device arrays.
 
-    Args:
-        bounded: whether loops are bounded and finished indices are counted, as on a GPU. Otherwise every kernel is one
-            launch, and arrays are NumPy arrays.
+    With `bounded`, as on a GPU, loops are bounded and finished indices are counted. Otherwise every kernel is one
+    launch, and arrays are NumPy arrays.
     """
 
     def __init__(self, *, bounded: bool) -> None:
@@ -46,15 +45,7 @@ class Launches:
         self._ended = self.upload(np.array([0, PROOF_ROUNDS if bounded else 0], np.int32))
 
     def array(self, dtype: DTypeLike, length: int) -> Any:
-        """Allocate an uninitialised array on the device.
-
-        Args:
-            dtype: type of the entries, an integer or a real number.
-            length: number of entries.
-
-        Returns:
-            A Taichi array of shape (length,); a NumPy array unless `bounded`.
-        """
+        """Allocate an uninitialised array of integers or real numbers, shape (length,), on the device."""
         if not self.bounded:
             return np.empty(length, dtype)
         kind = np.dtype(dtype)
@@ -74,14 +65,9 @@ class Launches:
         return array.to_numpy() if self.bounded else array
 
     def chunks(self, length: int, rounds: int) -> Iterator[tuple[int, int]]:
-        """Split a list, over which every thread iterates, into one chunk per launch.
+        """Split a list, over which every thread iterates, into chunks; yield the first entry and the length of each.
 
-        Args:
-            length: number of entries of the list.
-            rounds: largest number of loop iterations for an entry.
-
-        Yields:
-            The first entry and the length of each chunk; at least one chunk.
+        There is at least one chunk. `rounds` is the largest number of loop iterations for an entry.
         """
         chunk = max(1, length)
         if self.bounded:
@@ -91,13 +77,9 @@ class Launches:
             yield first, chunk
 
     def launch(self, kernel: Callable[..., None], total: int, *arguments: Any, rounds: int) -> None:
-        """Launch a kernel for all indices below `total`, split into several launches if necessary.
+        """Launch kernel(first, end, ended, *arguments) for all indices below `total`, in several launches if necessary.
 
-        Args:
-            kernel: kernel(first, end, ended, *arguments) for indices first to end - 1; `ended` is for `end_thread`.
-            total: number of indices.
-            *arguments: further arguments of the kernel.
-            rounds: largest number of loop iterations per index, over all loops.
+        `ended` is for `end_thread`, and `rounds` is the largest number of loop iterations per index, over all loops.
         """
         batch = total
         if self.bounded:
@@ -110,11 +92,7 @@ class Launches:
                 kernel(first, min(first + batch, total), self._ended, *arguments)
 
     def require_completion(self) -> None:
-        """Check that every index of every launch was completed.
-
-        Raises:
-            DeviceError: when the device ended a thread early.
-        """
+        """Raise a DeviceError if the device ended a thread before its last index."""
         if not self.bounded:
             return
         # The device counts in 32 bits.

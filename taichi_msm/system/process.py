@@ -114,14 +114,10 @@ _stderr_copy = 2
 
 
 class Interruption:
-    """A pending interruption by Ctrl-C or SIGTERM; a second signal ends the process at once.
-
-    Attributes:
-        code: exit code of an interrupted program, 128 plus the number of the signal.
-    """
+    """A pending interruption by Ctrl-C or SIGTERM; a second signal ends the process at once."""
 
     def __init__(self) -> None:
-        self.code = 128 + signal.SIGINT
+        self.code = 128 + signal.SIGINT  # exit code of an interrupted program
         self._requested = False
 
     def listen(self) -> None:
@@ -197,12 +193,7 @@ def discard_buffer(stream: TextIO) -> None:
 
 @contextmanager
 def discarded_output(*descriptors: int, into: str = os.devnull) -> Iterator[None]:
-    """Return a context that redirects file descriptors to a file, to capture or discard the output of libraries.
-
-    Args:
-        *descriptors: file descriptors such as 2 for stderr; closed ones stay closed.
-        into: file for the output; an existing one is overwritten.
-    """
+    """Return a context that redirects file descriptors, such as 2 for stderr, into a file; closed ones stay closed."""
     with _redirection_lock, Path(into).open("wb") as sink:
         copies = {}
         for descriptor in descriptors:

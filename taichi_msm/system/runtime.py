@@ -21,7 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from taichi_msm.arithmetic import Operations
-from taichi_msm.errors import ArgumentError, DeviceError, MsmError, did_you_mean
+from taichi_msm.errors import MAX_WORKERS, ArgumentError, DeviceError, MsmError, did_you_mean
 from taichi_msm.system.compiler import Patches, active_compiler
 from taichi_msm.system.files import private_folder
 from taichi_msm.system.process import available_threads, discarded_output, processor_name
@@ -35,9 +35,6 @@ _core: Any = getattr(np, "_core", None) or np.core  # NumPy 2, or 1
 _features: dict[str, bool] = _core._multiarray_umath.__cpu_features__
 
 ARCHS = ("cpu", "cuda", "vulkan")
-
-# Limit of CPU threads, above the cores of any machine; Taichi starts all of them.
-MAX_THREADS = 1024
 
 # Address space that Taichi needs: it reserves 1 GiB, and its libraries need nearly the same amount.
 MIN_ADDRESS_SPACE_BYTES = 1900 << 20
@@ -63,16 +60,7 @@ class Memory:
         weakref.finalize(self, _recycle, self._arrays, _free_arrays)
 
     def array(self, precision: str, lanes: int, length: int) -> Any:
-        """Allocate an array, or reuse a longer one; its content is arbitrary.
-
-        Args:
-            precision: f32 or f64.
-            lanes: number of components of each entry, a vector; 0 for scalar entries.
-            length: smallest number of entries.
-
-        Returns:
-            A Taichi array of at least `length` entries.
-        """
+        """Return an array, new or reused, of at least `length` vectors, or scalars if `lanes` is 0, of any content."""
         kind = precision, lanes
         fitting = [array for array in _free_arrays[kind] if array.shape[0] >= length]
         if fitting:
@@ -86,12 +74,7 @@ class Memory:
 
 
 def write_vectors(array: Any, values: NDArray[Any]) -> None:
-    """Write vectors to the first entries of an array, and zeros to the remaining ones.
-
-    Args:
-        array: Taichi array of f32 or f64 vectors.
-        values: the vectors, shape (entries, lanes), converted to the array's precision.
-    """
+    """Write vectors, shape (entries, lanes), to the first entries of a Taichi array, and zeros to the others."""
     real = np.float32 if array.dtype == ti.f32 else np.float64
     array.from_numpy(np.pad(values.astype(real), ((0, array.shape[0] - len(values)), (0, 0))))
 
@@ -147,23 +130,13 @@ def current_device() -> Device:
 
 
 def start(arch: str = "cpu", threads: int | None = None) -> Device:
-    """Start Taichi on a device, unless it already runs on it.
+    """Start Taichi on a device, unless it already runs on it; it cannot run on two devices in a process.
 
-    Args:
-        arch: cpu, cuda or vulkan.
-        threads: number of CPU threads, or None for one per available core.
-
-    Returns:
-        The device, with its name.
-
-    Raises:
-        ArgumentError: when the number of threads is invalid.
-        DeviceError: when the arch is not supported or not available, or Taichi already runs on another device.
-        MsmError: as `require_start_thread`.
+    None for `threads` is one per available core.
     """
     global _device, _start_thread
-    if threads is not None and not (type(threads) is int and 1 <= threads <= MAX_THREADS):
-        raise ArgumentError(f"threads: {threads!r}; take a whole number, 1 to {MAX_THREADS}, or None for every core")
+    if threads is not None and not (type(threads) is int and 1 <= threads <= MAX_WORKERS):
+        raise ArgumentError(f"threads: {threads!r}; take a whole number, 1 to {MAX_WORKERS}, or None for every core")
     if arch not in ARCHS:
         hint = did_you_mean(str(arch), ARCHS)
         raise DeviceError(f"--arch {arch}: not supported; take one of: {', '.join(ARCHS)}{hint}")
@@ -206,14 +179,8 @@ def compilation_options(*, optimised: bool = True) -> contextlib.AbstractContext
 
     Every operation is rounded by IEEE 754, so that the bits of a result do not depend on threads, lanes or compiler
     optimisation. On a CPU vectors are not split into scalars (docs/decisions/0010). Taichi's control-flow optimisation
-    is off: it takes half the compile time, and LLVM repeats it.
-
-    Args:
-        optimised: whether Taichi applies its other optimisations before LLVM; the same value at all launches of a
-            kernel.
-
-    Returns:
-        The context manager, within which kernels are launched.
+    is off: it takes half the compile time, and LLVM repeats it. Its other optimisations before LLVM are on if
+    `optimised`, which must be equal at all launches of a kernel.
     """
     config = ti.lang.impl.current_cfg()
     options: Patches = [
