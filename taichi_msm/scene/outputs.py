@@ -136,11 +136,7 @@ RESULT_PATTERNS = (
 
 
 def result_names(folders: Mapping[str, Collection[str]]) -> list[str]:
-    """Return the results of a run, as in `outputs` of run.json: folders of series, files, matrices of cameras, record.
-
-    Args:
-        folders: names of the outputs by folder; a folder for each camera, "" for the run (`Scene.folders`).
-    """
+    """Return the results of a run, as in `outputs` of run.json, from the outputs of each folder (`Scene.folders`)."""
     selected = [(folder, output) for output in OUTPUTS.values() for folder in folders if output.name in folders[folder]]
     selected.sort(key=lambda item: not item[1].is_series)
     # The labels of a stereo pair need the matrices of both cameras.
@@ -152,12 +148,7 @@ def result_names(folders: Mapping[str, Collection[str]]) -> list[str]:
 
 
 def file_names(results: Iterable[str], frames: int) -> list[str]:
-    """Return the paths of the files of a run.
-
-    Args:
-        results: names from `result_names`.
-        frames: frames of the run.
-    """
+    """Return the paths of the files of a run, from its `result_names` and its number of frames."""
     names: list[str] = []
     for result in results:
         folder, slash, name = result.rpartition("/")
@@ -167,13 +158,7 @@ def file_names(results: Iterable[str], frames: int) -> list[str]:
 
 
 def is_result(results: Collection[str], frames: int, name: str) -> bool:
-    """Return whether a path is one of `file_names`, without listing them.
-
-    Args:
-        results: names from `result_names`.
-        frames: frames of the run.
-        name: path within the folder of the run.
-    """
+    """Return whether a path within the folder of a run is one of its `file_names`, without listing them."""
     folder, _, file = name.rpartition("/")
     output, number = SERIES_FOLDERS.get(folder.rpartition("/")[2]), file.partition(".")[0]
     if output is None or not number.isdecimal():
