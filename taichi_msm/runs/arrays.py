@@ -32,12 +32,7 @@ class ChunkedArray(NamedTuple):
 
 
 def write_arrays(file: BinaryIO, arrays: Mapping[str, NDArray[Any] | ChunkedArray]) -> None:
-    """Write arrays to an uncompressed .npz archive. Equal arrays produce identical files.
-
-    Args:
-        file: binary file, open for writing at its start.
-        arrays: arrays by name, of any dtype without objects.
-    """
+    """Write arrays, by name, to an uncompressed .npz archive; equal arrays produce identical files."""
     with zipfile.ZipFile(file, "w", zipfile.ZIP_STORED) as archive:
         for name, array in arrays.items():
             chunked = _chunked(array)
@@ -59,20 +54,10 @@ def _chunked(array: NDArray[Any] | ChunkedArray) -> ChunkedArray:
 
 
 def read_array(archive: zipfile.ZipFile, name: str, dtype: DTypeLike, shape: Shape) -> NDArray[Any]:
-    """Read an array of the expected dtype and shape, and verify its CRC-32.
+    """Read an array of the expected dtype and shape, read-only, and verify its CRC-32.
 
-    Args:
-        archive: open .npz archive.
-        name: name of the array, without ".npy".
-        dtype: expected dtype, with byte order.
-        shape: expected shape, in C order.
-
-    Returns:
-        The array, read-only.
-
-    Raises:
-        ValueError: when dtype or shape differ; raised before memory is allocated.
-        Exception: when the archive is damaged; `zipfile` raises many types.
+    Another dtype or shape is a ValueError before memory is allocated; a damaged archive raises exceptions of many
+    types.
     """
     header, info = _npy_header(dtype, shape), _find_entry(archive, name, dtype, shape)
     data = archive.read(info)
@@ -82,37 +67,14 @@ def read_array(archive: zipfile.ZipFile, name: str, dtype: DTypeLike, shape: Sha
 
 
 def read_rows(archive: zipfile.ZipFile, name: str, dtype: DTypeLike, row_shape: Shape) -> NDArray[Any]:
-    """Read an array with any number of rows.
-
-    Args:
-        archive: as for `read_array`.
-        name: as for `read_array`.
-        dtype: as for `read_array`.
-        row_shape: expected shape without the first axis.
-
-    Returns:
-        The array, shape (rows, *row_shape), read-only.
-    """
+    """Read an array with any number of rows, shape (rows, *row_shape), as `read_array` does."""
     header_bytes, row_bytes = len(_npy_header(dtype, (0, *row_shape))), math.prod(row_shape) * np.dtype(dtype).itemsize
     rows = (archive.getinfo(f"{name}.npy").file_size - header_bytes) // row_bytes
     return read_array(archive, name, dtype, (max(0, rows), *row_shape))
 
 
 def map_array(path: Path, name: str, dtype: DTypeLike, shape: Shape) -> NDArray[Any]:
-    """Map an array of the expected dtype and shape into memory, and verify its CRC-32.
-
-    Args:
-        path: .npz archive.
-        name: as for `read_array`.
-        dtype: as for `read_array`.
-        shape: as for `read_array`; not empty.
-
-    Returns:
-        The array, read-only.
-
-    Raises:
-        ValueError: as for `read_array`, or when the CRC-32 differs.
-    """
+    """Map an array that is not empty into memory, read-only, and verify its CRC-32, with errors as `read_array`."""
     header = _npy_header(dtype, shape)
     with path.open("rb") as file, zipfile.ZipFile(file) as archive:
         info = _find_entry(archive, name, dtype, shape)
@@ -145,30 +107,14 @@ def _npy_header(dtype: DTypeLike, shape: Shape) -> bytes:
 
 
 def write_flo(file: BinaryIO, flow: NDArray[np.float32]) -> None:
-    """Write optical flow as .flo.
-
-    Args:
-        file: binary file, open for writing.
-        flow: displacement to the right and down [px], shape (height, width, 2).
-    """
+    """Write optical flow, displacement to the right and down [px], shape (height, width, 2), as .flo."""
     height, width, _ = flow.shape
     file.write(_flo_header(width, height))
     file.write(np.ascontiguousarray(flow, "<f4").data)
 
 
 def read_flo(path: Path, size: tuple[int, int]) -> NDArray[np.float32]:
-    """Read optical flow from a .flo file.
-
-    Args:
-        path: .flo file, possibly untrusted.
-        size: expected width and height [px].
-
-    Returns:
-        Displacement to the right and down [px], shape (height, width, 2), read-only.
-
-    Raises:
-        ValueError: when the file does not contain a flow of this size.
-    """
+    """Read the optical flow of a .flo file, as for `write_flo`; a ValueError unless it has this width and height."""
     width, height = size
     header, length = _flo_header(width, height), 8 * width * height
     with path.open("rb") as file:

@@ -73,15 +73,7 @@ class Manifest:
         return cast(dict[str, Any], _MANIFEST_ADAPTER.dump_python(self, mode="json"))
 
     def require_same_inputs(self, sha256: Mapping[str, str], versions: Mapping[str, str]) -> None:
-        """Require that resuming the run yields the same bits as a run without interruption.
-
-        Args:
-            sha256: current digests of picture, maps and cameras, from `input_digests`.
-            versions: current versions of software, by name.
-
-        Raises:
-            FilesError: when a file or a version has changed.
-        """
+        """Raise a FilesError if a file or a version has changed, so that a resumed run could yield other bits."""
         for key, path in self.scene.pictures.items():
             if sha256.get(key) != self.sha256.get(key):
                 raise FilesError(f"{path} has changed since the run began; put it back, or run the scene again")
@@ -111,10 +103,8 @@ _MANIFEST_ADAPTER = TypeAdapter(Manifest)
 def read_manifest(directory: Path) -> tuple[Manifest, Plan]:
     """Read the manifest of the unfinished run in a directory, and plan its scene.
 
-    Raises:
-        DamagedError: when the manifest is damaged or its scene cannot be run.
-        FilesError: when there is no unfinished run, or one of an earlier version of the program.
-        SceneError: when a map of the scene cannot be read.
+    A damaged manifest or an invalid scene is a DamagedError; the absence of a run, or one of an earlier version, a
+    FilesError; a map that cannot be read, a SceneError.
     """
     path = directory / STAGING_FOLDER / CHECKPOINT_FOLDER / STATE_FILE
     try:
@@ -183,24 +173,12 @@ def _damaged(path: Path) -> DamagedError:
 
 
 class Checkpoint:
-    """Checkpoint folder of a run, which is valid whenever the process is killed.
-
-    Args:
-        folder: path inside the staging folder; `begin` creates it.
-        plan: plan of the run; determines shapes and dtypes of the parts.
-
-    Raises:
-        DamagedError: from the methods that read, when a part is damaged; the message names the part.
-
-    Attributes:
-        frames: number of frames stored so far.
-        precision: dtype of the positions.
-    """
+    """Checkpoint folder of a run, valid whenever the process is killed; a damaged part is a DamagedError."""
 
     def __init__(self, folder: Path, plan: Plan) -> None:
         scene = plan.scene
-        self.frames = 0
-        self.precision = np.dtype(np.float32 if plan.grid.precision == "f32" else np.float64)
+        self.frames = 0  # number of frames stored so far
+        self.precision = np.dtype(np.float32 if plan.grid.precision == "f32" else np.float64)  # of the positions
         self._plan, self._state_path, self._frames_path = plan, folder / STATE_FILE, folder / FRAMES_FILE
         self._next_save, self._manifest = 0.0, b""
         self._file: BinaryIO | None = None  # None without outputs: the frames are not needed
@@ -248,12 +226,7 @@ class Checkpoint:
         return saved
 
     def add(self, position: NDArray[Any], forces: Sequence[TipForce]) -> None:
-        """Store the next frame.
-
-        Args:
-            position: positions of the mass points [m], shape (rows, cols, 3).
-            forces: force of every probe.
-        """
+        """Store the positions of the next frame [m], shape (rows, cols, 3), and the force of every probe."""
         if self._file:
             parts = np.ascontiguousarray(position, self.precision), _tip_force_array(forces)
             self._file.seek(self.frames * self._frame_dtype.itemsize)
@@ -272,10 +245,9 @@ class Checkpoint:
         return _tip_forces(self._read(frame)[1])
 
     def save(self, saved: Snapshot) -> str:
-        """Save a state, whose frames must be stored, in place of the previous one.
+        """Save a state, whose frames must be stored, in place of the previous one; return the path of its archive.
 
-        Returns:
-            Path of the archive, which has the fields of `State` and `RunProgress` by name.
+        The archive has the fields of `State` and `RunProgress` by name.
         """
         start = time.perf_counter()
         self._write_state(_to_arrays(saved))

@@ -67,26 +67,14 @@ class PublicationSpec(NamedTuple):
 class Publication:
     """Publication of new files in a directory: a context manager that discards them at exit, except after `publish`.
 
-    Args:
-        directory: destination; created if missing.
-        spec: files of the publication, and content of its record.
-        names: names of all files that may be published; checked for conflicts with foreign files.
-
-    Raises:
-        FilesError: here and in `publish`, when another process publishes to the directory, or a foreign file is at
-            the path of a result.
-        OSError: when the directory cannot be written.
-
-    Attributes:
-        staging_folder: folder for unpublished files.
-        new_folder: folder for the new files under their final names.
-        keep_unpublished: whether the unpublished folder of the spec is kept at exit.
+    `names` are all files that may be published. Another process that publishes to the directory, and a foreign file at
+    the path of one of them, are FilesErrors.
     """
 
     def __init__(self, directory: Path, spec: PublicationSpec, names: Collection[str] = ()) -> None:
-        self.staging_folder = directory / STAGING_FOLDER
-        self.new_folder = self.staging_folder / NEW_FOLDER
-        self.keep_unpublished = True
+        self.staging_folder = directory / STAGING_FOLDER  # for unpublished files
+        self.new_folder = self.staging_folder / NEW_FOLDER  # for new files under their final names
+        self.keep_unpublished = True  # whether the unpublished folder of the spec is kept at exit
         self._directory, self._spec, self._record = directory, spec, directory / spec.record
         self._unpublished, inner = spec.unpublished or ("", ())
         self._patterns = [
@@ -244,36 +232,14 @@ def entry_kind(path: Path) -> str | None:
 
 
 def require_kind(path: Path, kind: str) -> Path:
-    """Require that an entry is of the expected kind, or missing.
-
-    Args:
-        path: entry of a directory; links are not followed.
-        kind: expected kind, FILE or FOLDER.
-
-    Returns:
-        The path.
-
-    Raises:
-        ForeignError: when the entry is of another kind, such as a link.
-    """
+    """Return a path whose entry is of a kind, FILE or FOLDER, or missing; others, such as links, are ForeignErrors."""
     if (actual := entry_kind(path)) not in (None, kind):
         raise ForeignError.at(path, str(actual))
     return path
 
 
 def require_no_link(folder: Path, option: str) -> Path:
-    """Require that a default folder is not a symbolic link, which may come with an untrusted scene.
-
-    Args:
-        folder: default destination, which may be missing.
-        option: command-line option that selects another folder, for the remedy.
-
-    Returns:
-        The folder.
-
-    Raises:
-        FilesError: when it is a link or cannot be read.
-    """
+    """Return a default folder; raise a FilesError if it is a symbolic link, which may come with an untrusted scene."""
     try:
         is_link = folder.is_symlink()
     except OSError as error:
@@ -284,19 +250,10 @@ def require_no_link(folder: Path, option: str) -> Path:
 
 
 def list_files(top: Path, patterns: Collection[str], *, strict: bool, ignored: Collection[str] = ()) -> Iterator[str]:
-    """Yield the files below a folder whose relative paths match a pattern; links are not followed.
+    """Yield the files below a folder whose relative paths, with slashes, match a pattern; links are not followed.
 
-    Args:
-        top: root of the relative paths.
-        patterns: regular expressions of relative paths; the part before each slash is that of a subfolder.
-        strict: whether entries without a match are errors.
-        ignored: names of entries to ignore.
-
-    Yields:
-        Paths relative to `top`, with slashes.
-
-    Raises:
-        ForeignError: with `strict`, at the first entry that matches no pattern.
+    The part of a pattern before each slash is that of a subfolder. With `strict`, an entry without a match is a
+    ForeignError. Entries with a name in `ignored` are skipped.
     """
     files, folders = re.compile("|".join(patterns)), re.compile("|".join(parent_folders(patterns)))
 
@@ -377,17 +334,7 @@ def replacing(path: Path) -> Iterator[BinaryIO]:
 
 
 def move_to_free_name(draft: Path, folder: Path, stem: str, suffix: str) -> Path:
-    """Move a file to the first free name in a folder: stem-1.suffix, stem-2.suffix and so on.
-
-    Args:
-        draft: the file, on the same file system.
-        folder: destination.
-        stem: name without number and suffix.
-        suffix: suffix with its dot.
-
-    Returns:
-        The new path.
-    """
+    """Move a file to the first free name in a folder: stem-1.suffix, stem-2.suffix and so on; return its path."""
     number = 1
     while os.path.lexists(path := folder / f"{stem}-{number}{suffix}") or not link_without_replacing(draft, path):
         number += 1
@@ -395,14 +342,9 @@ def move_to_free_name(draft: Path, folder: Path, stem: str, suffix: str) -> Path
 
 
 def link_without_replacing(draft: Path, path: Path) -> bool:
-    """Link a file to a new path, or move it there on a file system without links.
+    """Link a file to a new path, or move it on a file system without links; return whether the path was free.
 
-    Args:
-        draft: the file, on the same file system.
-        path: the new path. An existing file is kept, except in a race on a file system without links.
-
-    Returns:
-        Whether the path was free.
+    An existing file is kept, except in a race on a file system without links.
     """
     try:
         # A rename would replace an existing file.
@@ -420,15 +362,7 @@ def create_file(path: Path) -> BinaryIO:
 
 
 def write_new_file(path: Path, data: bytes) -> None:
-    """Create a file with its content.
-
-    Args:
-        path: new path in an existing folder.
-        data: content of the file.
-
-    Raises:
-        FileExistsError: when the path exists.
-    """
+    """Create a file with its content; raise a FileExistsError if it exists."""
     with create_file(path) as file:
         file.write(data)
 
@@ -436,8 +370,7 @@ def write_new_file(path: Path, data: bytes) -> None:
 def lock_file(path: Path) -> BinaryIO:
     """Lock a file, created if missing, until it is closed here and in all processes that inherit it.
 
-    Raises:
-        BlockingIOError: when another process holds the lock.
+    A lock of another process is a BlockingIOError.
     """
     file = path.open("ab", 0)
     try:

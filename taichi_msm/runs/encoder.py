@@ -56,12 +56,8 @@ class EncodingReport(NamedTuple):
 class PictureWriter:
     """Encoder of pictures in threads of this process. A KeyboardInterrupt does not reach the threads.
 
-    Args:
-        job: formats, destinations and size of the pictures.
-        max_queued: number of frames that may be queued; with 0, `add` returns when its frame is encoded.
-
-    Raises:
-        OSError: from any method, at the latest from `finish`, when a file cannot be written.
+    With a queue of 0 frames, `add` returns when its frame is encoded. Any method, at the latest `finish`, raises the
+    OSError of a file.
     """
 
     def __init__(self, job: EncodingJob, max_queued: int = 0) -> None:
@@ -75,10 +71,9 @@ class PictureWriter:
         self._video_executor = ThreadPoolExecutor(1)
 
     def add(self, pictures: Picture) -> None:
-        """Add the pictures of the next frame; wait while the queue is full.
+        """Add the pictures of the next frame, shape (cameras, height, width, 3); wait while the queue is full.
 
-        Args:
-            pictures: colours, shape (cameras, height, width, 3); the caller must not change them afterwards.
+        The caller must not change them afterwards.
         """
         paths = self._job.still_paths(self._added_frames)
         if self._added_frames == 0:
@@ -151,14 +146,9 @@ def _write_still(picture: Picture, path: Path) -> float:
 
 
 class Encoder:
-    """Encoder of pictures in a child process, with the methods of `PictureWriter`.
+    """Encoder of pictures in a child process, which inherits descriptors, with the methods of `PictureWriter`.
 
-    Args:
-        job: formats, destinations and size of the pictures.
-        inherit: file descriptors that the child inherits, such as locks.
-
-    Raises:
-        OSError: from any method, at the latest from `finish`, when a file cannot be written or the process has died.
+    Any method, at the latest `finish`, raises the OSError of a file or of a process that has died.
     """
 
     def __init__(self, job: EncodingJob, inherit: tuple[int, ...] = ()) -> None:

@@ -42,21 +42,14 @@ def predict_colours(picture: Picture) -> Picture:
 
 
 class Palette:
-    """Colour palette of an animation.
-
-    Args:
-        samples: typical colours, shape (n, m, 3).
-        background: a colour that the palette contains exactly.
-
-    Attributes:
-        table: the colours, shape (256, 3); unused entries are black.
-    """
+    """Colour palette of an animation: exactly the background, and typical colours, from samples of shape (n, m, 3)."""
 
     def __init__(self, samples: Picture, background: tuple[int, int, int]) -> None:
         # Pillow's default, median cut, loses rare hues: the purple vessels of the shipped scenes become brown.
         method = Image.Quantize.MAXCOVERAGE
         reduced = Image.fromarray(samples).quantize(PALETTE_SIZE - 1, method=method, kmeans=1).getpalette() or []
         colours = np.array([*background, *reduced], np.uint8).reshape(-1, 3)
+        # The colours, shape (256, 3); unused entries are black.
         self.table: Picture = np.concatenate([colours, np.zeros((PALETTE_SIZE + 1 - len(colours), 3), np.uint8)])
         self._background = background
         self._lookup = Image.new("P", (1, 1))
@@ -77,13 +70,7 @@ class GifWriter:
     """Writer of an endlessly looping GIF. Frame f lasts from f / rate to (f + 1) / rate, rounded to 1/100 s.
 
     Frames shorter than 2/100 s are dropped, except for the last one, which shortens its predecessor. Equal consecutive
-    frames are merged.
-
-    Args:
-        file: binary file, open for writing; `close` closes it.
-        size: width and height [px].
-        rate: frames per second.
-        palette: palette of all frames.
+    frames are merged. The size is width and height [px].
     """
 
     def __init__(self, file: BinaryIO, size: tuple[int, int], rate: float, palette: Palette) -> None:
@@ -173,13 +160,8 @@ MAX_RATE_DENOMINATOR = 1 << 16
 class Mp4Writer:
     """Writer of an MP4. Frame f lasts from f / rate to (f + 1) / rate.
 
-    An odd number of rows or columns is padded by repeating the last one, because H.264 subsamples colours by 2 x 2.
-
-    Args:
-        file: seekable binary file with a name, open for writing; `close` closes it.
-        size: width and height [px].
-        rate: frames per second.
-        quality: 1 to 100 [%].
+    An odd number of rows or columns is padded by repeating the last one, because H.264 subsamples colours by 2 x 2. The
+    file must be seekable and have a name; the size is width and height [px], the quality 1 to 100 [%].
     """
 
     def __init__(self, file: BinaryIO, size: tuple[int, int], rate: float, quality: int) -> None:

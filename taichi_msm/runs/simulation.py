@@ -590,12 +590,7 @@ _player_numbers = count()
 
 
 class Player:
-    """Playback of frames in a notebook, with a button and a slider.
-
-    Args:
-        frames: pictures, each of shape (height, width, 3); at least one.
-        rate: frames per second.
-    """
+    """Playback of pictures, each of shape (height, width, 3), in a notebook, with a button and a slider."""
 
     def __init__(self, frames: Sequence[NDArray[np.uint8]], rate: float) -> None:
         self.frames = tuple(frames)

@@ -44,24 +44,9 @@ class ResultWriter:
     """Streaming writer of the results of a run, as a context manager.
 
     Files are written to a hidden folder, and `publish` moves them into place atomically. Without `publish`, they are
-    deleted at exit. With a manifest, a checkpoint exists from the first frame to the publication of complete results.
-    Foreign files in the directory are never changed.
-
-    Args:
-        directory: destination of the results.
-        plan: plan of the resolved scene.
-        manifest: manifest of the run for its checkpoint; None for a run that cannot be resumed.
-        resumes: whether to continue from the checkpoint in the directory.
-        encode_in_subprocess: whether to encode pictures in a parallel child process; otherwise `add` encodes them.
-
-    Raises:
-        FilesError: here and in all methods, when the directory cannot be written, another run writes there, or a
-            foreign file is at the path of a result.
-
-    Attributes:
-        saved: state from which the run continues; None for the initial state.
-        frames: number of frames in the results; after an interruption, valid after `finish`.
-        encode_seconds: processor time of encoding pictures [s]; valid after `finish`.
+    deleted at exit. With a manifest, a checkpoint exists from the first frame to the publication of complete results,
+    and a later writer `resumes` from it. Without a subprocess, `add` encodes the pictures. Foreign files in the
+    directory are never changed; one at the path of a result is a FilesError, as is another run that writes there.
     """
 
     def __init__(
@@ -76,7 +61,7 @@ class ResultWriter:
         self._directory, self._manifest = directory, manifest
         self._scene = scene = plan.scene
         self._finished = False
-        self.encode_seconds = 0.0
+        self.encode_seconds = 0.0  # processor time of encoding pictures; valid after `finish`
         names = outputs.file_names(outputs.result_names(scene.folders), scene.time.frames + 1)
         with writing(directory), ExitStack() as opened:
             self._publication = opened.enter_context(Publication(directory, RUN_PUBLICATION, names))
@@ -94,7 +79,9 @@ class ResultWriter:
                 opened.callback(self._encoder.abort)
             self._checkpoint = Checkpoint(self._publication.staging_folder / CHECKPOINT_FOLDER, plan)
             opened.callback(self._checkpoint.close)
+            # State from which the run continues; None for the initial state.
             self.saved = self._checkpoint.reopen() if resumes else None
+            # Number of frames in the results; after an interruption, valid after `finish`.
             self.frames = 0 if scene.renders else self.stored_frames
             self._open = opened.pop_all()
 
@@ -116,12 +103,9 @@ class ResultWriter:
     def add(
         self, position: NDArray[Any], observed: Mapping[str, FrameOutputs], forces: Sequence[TipForce] = ()
     ) -> None:
-        """Add the next frame. If it is already in the checkpoint of a resumed run, only its files are written.
+        """Add the next frame: positions [m], shape (rows, cols, 3), outputs by camera, and the force of every probe.
 
-        Args:
-            position: positions of the mass points [m], shape (rows, cols, 3).
-            observed: pictures and labels, by the names of the cameras.
-            forces: force of every probe.
+        If the frame is already in the checkpoint of a resumed run, only its files are written.
         """
         with writing(self._directory):
             # Positions are stored first, so that an interruption never leaves a picture without positions.
@@ -192,13 +176,13 @@ class ResultWriter:
             "time": np.arange(frames) / self._scene.time.frames_per_second,
             "position": ChunkedArray(checkpoint.precision, shape, map(checkpoint.read_positions, range(frames))),
         }
-        with create_file(self._publication.new_folder / outputs.OUTPUTS["trajectory"].path()) as file:
+        with create_file(self._publication.new_folder / OUTPUTS["trajectory"].path()) as file:
             write_arrays(file, arrays)
 
     def _write_forces(self) -> None:
         """Write the forces of all frames, as decimals that round-trip to float64."""
         with (
-            create_file(self._publication.new_folder / outputs.OUTPUTS["forces"].path()) as file,
+            create_file(self._publication.new_folder / OUTPUTS["forces"].path()) as file,
             io.TextIOWrapper(file, encoding="ascii", newline="") as text,
         ):
             rows = csv.writer(text, lineterminator="\n")
@@ -216,13 +200,7 @@ class ResultWriter:
 
 
 class LabelWriter:
-    """Writer of the labels of a camera, frame by frame.
-
-    Args:
-        folder: destination of the labels.
-        scene: resolved scene, whose `output` selects the labels.
-        camera: name of the camera; empty for an unnamed one.
-    """
+    """Writer of the labels of a camera, "" for an unnamed one, frame by frame."""
 
     def __init__(self, folder: Path, scene: Scene, camera: str) -> None:
         self._folder, self._scene, self._camera = folder, scene, camera
@@ -237,13 +215,7 @@ class LabelWriter:
         self._added = 0
 
     def add(self, frame: int, observed: FrameOutputs, position: NDArray[Any]) -> None:
-        """Write the labels of a frame; tracks are kept until `finish`.
-
-        Args:
-            frame: index, from 0.
-            observed: labels of the camera in this frame.
-            position: positions of the mass points [m], shape (rows, cols, 3).
-        """
+        """Write the labels of a frame, with positions [m], shape (rows, cols, 3); tracks are kept until `finish`."""
         self._added = frame + 1
         for output in self._frame_outputs:
             number = frame - 1 if output.is_frame_pair else frame
