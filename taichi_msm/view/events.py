@@ -125,16 +125,9 @@ _EVENTS: dict[str, TypeAdapter[Event]] = {
 
 
 def parse_message(message: str | bytes) -> Event | None:
-    """Parse a message of a page.
+    """Parse a message of a page, a JSON list of the name of an event and its values; return None for `SHOWN`.
 
-    Args:
-        message: JSON list of the name of an event and its values.
-
-    Returns:
-        The event; None for `SHOWN`.
-
-    Raises:
-        ValueError: when the message is invalid; names the event and the reason.
+    The ValueError of an invalid message has the event and the reason.
     """
     values: Any = json.loads(message)
     if values == SHOWN:

@@ -38,13 +38,7 @@ def material_values(scene: Scene) -> dict[str, float]:
 
 
 def with_value(section: Any, key: str, value: float) -> Any:
-    """Return a copy of a scene or a section with another value.
-
-    Args:
-        section: a scene or one of its sections; the copy is not validated.
-        key: dotted path of a number, relative to the section.
-        value: the number, in the unit of the key.
-    """
+    """Return a copy of a scene or a section with another value of a number, whose key is a dotted path."""
     name, _, rest = key.partition(".")
     changed: Section | float = with_value(getattr(section, name), rest, value) if rest else value
     return section.model_copy(update={name: changed})

@@ -41,14 +41,10 @@ def write_text(
     table: Mapping[str, str] | None = None,
     bar: ValueBar | None = None,
 ) -> None:
-    """Write text on dark panels over a picture, in place.
+    """Write text on dark panels over a picture, shape (height, width, 3), in place.
 
-    Args:
-        picture: shape (height, width, 3).
-        above: lines in the upper left corner, above the bar and the two columns of the table.
-        below: text at the bottom, wrapped to the width.
-        table: text of two columns, such as keys and their effects; None for no table.
-        bar: bar between the lines and the table; None for no bar.
+    The lines `above`, the bar and the table of two columns are in the upper left corner, one under another; the text
+    `below` is at the bottom, wrapped to the width.
     """
     height, width = picture.shape[:2]
     # Height of letters [px].
@@ -67,12 +63,9 @@ def write_text(
 
 
 def mark_tool(picture: Picture, pixel: tuple[float, float], *, pulls: bool) -> None:
-    """Draw a ring around a tool into a picture, in place.
+    """Draw a ring around a pixel (x, y) into a picture, shape (height, width, 3), in place; yellow if the tool pulls.
 
-    Args:
-        picture: shape (height, width, 3).
-        pixel: centre (x, y) of the ring [px]; may be outside of the picture.
-        pulls: whether the ring is yellow, for a pulling tool, instead of white.
+    The pixel may be outside of the picture.
     """
     radius = picture.shape[0] * (1 / 50)
     reach = int(radius) + 4

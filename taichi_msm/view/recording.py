@@ -24,23 +24,17 @@ from taichi_msm.scene.scene import Scene
 
 
 class Film:
-    """Film of a running session, encoded in a hidden folder; `close` removes the folder.
+    """Film of a running session, .gif or .mp4, encoded in a hidden folder next to it; `close` removes the folder.
 
-    All methods raise a FilesError when the film cannot be written.
-
-    Args:
-        path: path of the film, .gif or .mp4; the hidden folder is next to it.
-        option: command-line option of the path, for messages.
-        render: size, background and quality of the pictures.
-        rate: frames of the session per second.
-        subframes: frames of the session per picture of the film.
-        begin: frame of the session at which the film begins.
+    All methods raise a FilesError, with the command-line option of the path, when the film cannot be written.
     """
 
     def __init__(self, path: Path, option: str, render: Render, rate: float, subframes: int, begin: int) -> None:
         self.pictures = 0
         self._format = path.suffix.lower().removeprefix(".")
-        self._subframes, self._begin, self._location = subframes, begin, (path.parent, option)
+        # Frames of the session per picture of the film, and that at which the film begins.
+        self._subframes, self._begin = subframes, begin
+        self._location = path.parent, option
         with writing(*self._location), ExitStack() as opened:
             self._hidden = opened.enter_context(hidden_folder(path.parent))
             job = EncodingJob(
@@ -51,12 +45,7 @@ class Film:
             self._opened = opened.pop_all()
 
     def add_frame(self, picture: Picture, frame: int) -> None:
-        """Append a picture, repeated for the pictures skipped since the last call.
-
-        Args:
-            picture: shape (height, width, 3).
-            frame: number of the frame in the session.
-        """
+        """Append the picture, shape (height, width, 3), of a frame of the session, also in place of skipped ones."""
         with writing(*self._location):
             while self.pictures * self._subframes <= frame - self._begin:
                 self._encoder.add(picture[None])
@@ -74,22 +63,12 @@ class Film:
 
 
 class Captures:
-    """Folder for the files of a session, created with the first file.
-
-    The methods raise a FilesError when the folder cannot be written.
-
-    Args:
-        folder: path of the folder.
-        name: name of the scene, for a comment in saved scenes.
-
-    Attributes:
-        saved: paths of the saved files, in order.
-    """
+    """Folder for the files of a session, created with the first file; a FilesError if it cannot be written."""
 
     def __init__(self, folder: Path, name: str) -> None:
         self.folder = folder
-        self.saved: list[Path] = []
-        self._name = name
+        self.saved: list[Path] = []  # in order
+        self._name = name  # of the scene, for a comment in saved scenes
 
     def save_picture(self, picture: Picture) -> Path:
         """Save a picture, shape (height, width, 3), as PNG; return its path."""
@@ -114,15 +93,7 @@ class Captures:
             return self._move_to_free_name(hidden / "session", "session", ".yaml")
 
     def save_film(self, film: Film, path: Path | None = None) -> Path:
-        """Finish and save a film.
-
-        Args:
-            film: a film with at least one picture.
-            path: destination, replaced if it exists; None for a free name in the folder.
-
-        Returns:
-            The path of the saved film.
-        """
+        """Finish and save a film with at least one picture at a path, by default a free name; return the path."""
         with closing(film), writing(path or self.folder):
             if path is None:
                 return self._move_to_free_name(film.finish(), "film", ".gif")

@@ -8,12 +8,11 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
 from pydantic import Field, field_validator, model_validator
-from pydantic_core import PydanticCustomError
 
 from taichi_msm.errors import FilesError, Problem, SceneError, writing
 from taichi_msm.load.check import parse_model
 from taichi_msm.load.scene_file import Draft, FileKind, read_file
-from taichi_msm.scene.section import MAX_PIXELS, SCENE_FAULT, NotNegative, Number, Pixels, Section, key
+from taichi_msm.scene.section import MAX_PIXELS, NotNegative, Number, Pixels, Section, key, scene_fault
 from taichi_msm.view.events import KEYS, Drag, Event, Key, Press, Release, Strength, Turn
 from taichi_msm.view.recording import Film
 
@@ -59,13 +58,13 @@ class ScriptEvent(Section):
         for name in ("at", "by", "to", "name"):
             given, required = getattr(self, name) is not None, REQUIRED_KEYS[self.do] == name
             if given != required:
-                message = "missing; {do} needs it" if required else "{do} takes none; remove it"
-                raise _refused(name, message, do=self.do)
+                raise scene_fault(
+                    f"missing; {self.do} needs it" if required else f"{self.do} takes none; remove it", name
+                )
         if self.name is not None and self.name not in SCRIPT_KEYS:
-            message = "there is no key '{name}' here; expected one of: {keys}"
-            raise _refused("name", message, name=self.name, keys=", ".join(SCRIPT_KEYS))
+            raise scene_fault(f"there is no key '{self.name}' here; expected one of: {', '.join(SCRIPT_KEYS)}", "name")
         if self.seconds > 0 and self.do not in ("drag", "turn"):
-            raise _refused("seconds", "{do} takes no time; remove it", do=self.do)
+            raise scene_fault(f"{self.do} takes no time; remove it", "seconds")
         return self
 
 
@@ -87,31 +86,16 @@ class Script(Section):
         presses, end = False, 0.0
         for n, entry in enumerate(events):
             if entry.do in ("drag", "release") and not presses:
-                raise _refused(n, "{do} when nothing is pressed; put a press or a pull before it", do=entry.do)
+                raise scene_fault(f"{entry.do} when nothing is pressed; put a press or a pull before it", n)
             if entry.t < end:
-                message = "begins at {t} s, before the previous event ends at {end} s; take a later t"
-                raise _refused(n, message, t=f"{entry.t:g}", end=f"{end:g}")
+                fault = f"begins at {entry.t:g} s, before the previous event ends at {end:g} s"
+                raise scene_fault(f"{fault}; take a later t", n)
             presses, end = entry.do in ("press", "pull") or (presses and entry.do != "release"), entry.t + entry.seconds
         return events
 
 
-def _refused(key: str | int, message: str, **values: str) -> PydanticCustomError:
-    return PydanticCustomError(SCENE_FAULT, message, {"below": (key,), **values})
-
-
 def load_script(path: str | Path, size: tuple[int, int]) -> Script:
-    """Read and check a script.
-
-    Args:
-        path: the script file.
-        size: width and height of the session's picture [px].
-
-    Returns:
-        The script; all presses are in the picture.
-
-    Raises:
-        SceneError: with a line for each error of the file, in the order of the file.
-    """
+    """Read and check a script for a picture of a width and height [px], in which all presses must be."""
     draft = Draft(read_file(str(path), FileKind("script", "events")))
     script, problems = parse_model(Script, draft.data)
     draft.report(problems)
@@ -132,15 +116,9 @@ def _outside(script: Script, size: tuple[int, int]) -> Iterator[Problem]:
 
 
 def schedule_events(script: Script, rate: float, size: tuple[int, int]) -> Iterator[tuple[int, Event]]:
-    """Convert a script to events of a session.
+    """Yield the events of a script with the frame before which each is handled, in order of frames.
 
-    Args:
-        script: a checked script.
-        rate: frames per second of the session.
-        size: width and height of the session's picture [px].
-
-    Yields:
-        Frame number, and an event to handle before this frame is drawn; in order of frames.
+    `rate` is frames per second, and `size` width and height [px] of the session's picture.
     """
     scale = [actual / assumed for actual, assumed in zip(size, script.size or size, strict=True)]
     x = y = 0.0
@@ -176,18 +154,10 @@ def record_film(
     progress: Callable[[int, int], None] = lambda done, total: None,
     notify: Callable[[str], None] = lambda notice: None,
 ) -> None:
-    """Run a session without a page, and film it; the finished film replaces an existing file.
+    """Run a new session for some seconds without a page, and film it; the finished film replaces an existing file.
 
-    Args:
-        session: a new session.
-        path: the film, .gif or .mp4.
-        seconds: duration of the film [s].
-        events: pairs of a frame number and an event, from `schedule_events`; consumed lazily.
-        progress: called for every frame with the finished and the total number; an exception from it stops the session.
-        notify: called with every notice of the session.
-
-    Raises:
-        FilesError: when the film cannot be written; after the film is written, when an event could not save a file.
+    `events` are those of `schedule_events`, consumed lazily; `notify` receives every notice of the session. If an event
+    could not save a file, the FilesError comes after the film is written.
     """
     frames = round(seconds * session.frame_rate)
     events = iter(events)

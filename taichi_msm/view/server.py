@@ -89,17 +89,7 @@ SAVES = (events.Key("p"), events.Key("w"))
 
 
 def listen(port: int) -> socket.socket:
-    """Listen on a port of the loopback interface.
-
-    Args:
-        port: number of the port, or 0 for a free one.
-
-    Returns:
-        A listening, non-blocking socket.
-
-    Raises:
-        DeviceError: when the port cannot be used.
-    """
+    """Return a listening, non-blocking socket at a port of the loopback interface; 0 for a free port."""
     try:
         listener = socket.create_server((ADDRESS, port))
     except OSError as error:
@@ -112,16 +102,8 @@ def listen(port: int) -> socket.socket:
 class Server:
     """Server of a session to pages in browsers. The page that has been open longest steers; the others watch.
 
-    Args:
-        session: a new session.
-        listener: listening socket, from `listen`.
-        title: title of the page.
-        origins: permitted origins of pages behind a proxy; origins of the loopback interface are always permitted.
-        warn: called with lines for the user.
-
-    Attributes:
-        url: address of the page, with the token.
-        pages: connected pages; the first one steers.
+    `origins` are those of pages behind a proxy; origins of the loopback interface are always permitted. `warn` receives
+    lines for the user.
     """
 
     def __init__(
@@ -136,7 +118,7 @@ class Server:
         self._origins = {parse_origin(origin) for origin in origins}
         self._port, self._token = listener.getsockname()[1], secrets.token_urlsafe(24)
         self.url = f"http://{ADDRESS}:{self._port}/{self._token}/"
-        self.pages: list[_Connection] = []
+        self.pages: list[_Connection] = []  # the first one steers
         self._events: deque[events.Event] = deque()
         self._handled = 0
         # Last picture, as drawn and as JPEG.
@@ -144,11 +126,7 @@ class Server:
         self._jpeg = b""
 
     async def run(self, pause: Pause) -> None:
-        """Serve the session until the page that steers quits.
-
-        Args:
-            pause: called before every picture; an exception from it ends the session.
-        """
+        """Serve the session until the page that steers quits; `pause` is called before every picture."""
         handlers: list[Any] = [(r"/[^/]+/socket", _Connection, {"server": self}), (r".*", _Page, {"server": self})]
         application = Application(
             handlers,
@@ -213,12 +191,7 @@ class Server:
         self.pages.remove(page)
 
     def receive(self, page: _Connection, message: str | bytes) -> None:
-        """Queue the event of a message; reply to an invalid one with its error.
-
-        Args:
-            page: the sender; its events are ignored unless it steers.
-            message: text for `events.parse_message`.
-        """
+        """Queue the event of a message if its page steers; reply to an invalid message with its error."""
         try:
             event = events.parse_message(message)
         except (ValueError, RecursionError) as error:
@@ -320,12 +293,7 @@ class Server:
 
 
 class Pacing:
-    """Schedule of frames in real time.
-
-    Args:
-        rate: frames per second of the session.
-        clock: returns the current time [s].
-    """
+    """Schedule of frames in real time, for a rate [1/s] and a clock that returns the time [s]."""
 
     def __init__(self, rate: float, clock: Callable[[], float]) -> None:
         self._rate = rate

@@ -42,12 +42,9 @@ NOTICE_DURATION_S = 3.0
 
 
 def divide_frames(plan: Plan) -> tuple[Plan, int]:
-    """Divide every frame of a plan into the largest number of subframes within `MAX_FRAME_RATE`.
+    """Divide every frame of a plan into the largest number of subframes within `MAX_FRAME_RATE`; return both.
 
     In motion, `precision: auto` without a tolerance becomes f32, which takes half the time of f64.
-
-    Returns:
-        The plan with subframes as its frames, and the number of subframes per frame.
     """
     scene = plan.scene
     subframes = max(1, int(MAX_FRAME_RATE / scene.time.frames_per_second * (1 + 1e-9)))
@@ -67,25 +64,9 @@ class Session:
     There are up to two tools. The force-controlled one has the force, falloff and offset of the first probe with a
     force. The position-controlled one has the instrument and friction of the first probe with a path, otherwise of the
     first probe with an instrument. The first probe that is not a clamp decides which one is used first. Clamps always
-    hold the sheet.
+    hold the sheet; with `play`, the scene's other probes act in addition to the tool.
 
-    Args:
-        scene: scene that is simulated.
-        captures: receives saved files.
-        arch: cpu, cuda or vulkan.
-        threads: number of CPU threads, by default one per core.
-        play: whether the scene's own probes act in addition to the tool.
-        progress: called often with the stage; an exception from it stops the construction.
-
-    Raises:
-        SceneError: when the scene has no picture, no probe, or too many probes.
-        DeviceError: when the arch is not available.
-
-    Attributes:
-        scene: the scene with the frames and the time step of the session.
-        tool: current tool.
-        subframes: frames of the session per frame of the scene that was given.
-        divergence_error: message of the divergence that stopped the simulation; empty without one.
+    `progress` is called often with the stage; an exception from it stops the construction.
     """
 
     def __init__(
@@ -102,6 +83,7 @@ class Session:
         progress("start")
         device = runtime.start(arch, threads)
         texture = load_texture(scene)
+        # Frames of the session per frame of the given scene; `self.scene` has those of the session.
         live, self.subframes = divide_frames(check_scene(scene))
         plan = resolve(live, device, lambda done, total: progress("pilot")).plan
         scene = plan.scene
@@ -124,7 +106,7 @@ class Session:
         # Elapsed frames, including those of pauses.
         self._elapsed = 0
         self._notice, self._notice_until = "", 0
-        self.divergence_error = ""
+        self.divergence_error = ""  # message of the divergence that stopped the simulation
         # Moving average of the time to simulate a frame [s].
         self._frame_time_s = 0.0
         # Largest force since the last reset [N].
@@ -187,11 +169,7 @@ class Session:
         )
 
     def handle(self, event: events.Event) -> None:
-        """Process an event, with effect from the next frame on.
-
-        Raises:
-            FilesError: when a file cannot be saved.
-        """
+        """Process an event, with effect from the next frame on; raise a FilesError if a file cannot be saved."""
         match event:
             case events.Hover(x, y):
                 self._hover_pixel = x, y
@@ -248,14 +226,7 @@ class Session:
         return self._film is not None
 
     def start_film(self, path: Path | None = None) -> None:
-        """Start a film, which is saved when it ends.
-
-        Args:
-            path: destination; None for a free name in the folder of captures.
-
-        Raises:
-            FilesError: when the film cannot be written.
-        """
+        """Start a film, which is saved when it ends, by default under a free name in the folder of captures."""
         file, option = (self._captures.folder / "film.gif", "--out") if path is None else (path, "--record")
         self._film = Film(file, option, self.scene.render, self.frame_rate, self.subframes, self._elapsed)
         self._film_path = path

@@ -37,16 +37,7 @@ STARTS: tuple[SheetPosition, ...] = (CENTRE, *product((0.1, 0.9), (0.1, 0.9)), *
 
 
 def clear_start(probe: Probe, scene_probes: Sequence[Probe], scene: Scene) -> SheetPosition:
-    """Return the first of `STARTS` at which an idle tool intersects no other tool of the session.
-
-    Args:
-        probe: probe of the tool.
-        scene_probes: probes of the other tools.
-        scene: scene with the sheet and the duration of the motion.
-
-    Returns:
-        The position; the centre if every one intersects, or for a tool without an instrument.
-    """
+    """Return the first of `STARTS` at which an idle tool intersects no tool of `scene_probes`, or else the centre."""
     if probe.instrument is None:
         return CENTRE
     others = [_capsule(each, scene.sheet) for each in scene_probes if each.instrument is not None]
@@ -84,27 +75,17 @@ class ForceControlledTool:
 
     A frame applies at most one press or release, and the others wait: the force is 0 for at least a frame before the
     tool acts at another position. It rises within `RISE_TIME_S`, and drops to 0 at a release.
-
-    Args:
-        probe: probe with the force, falloff and offset.
-        frame_rate: frames per second of the session.
-        start: position before the first press.
-
-    Attributes:
-        strength: force of a press [% of the full force].
-        percent: current force [% of the full force]; negative when pulling.
-        position: current control point, fractions (across, down) of the sheet.
     """
 
     def __init__(self, probe: Probe, frame_rate: float, start: SheetPosition = CENTRE) -> None:
-        self.strength = 100.0
+        self.strength = 100.0  # force of a press [% of the full force]
         self.probe = probe
         self._frame_rate, self._start = frame_rate, start
         self.reset()
 
     def reset(self) -> None:
         """Discard the recorded keyframes and the pending actions."""
-        self.percent = 0.0
+        self.percent = 0.0  # current force [% of the full force]; negative when pulling
         self.position = self._start
         self._target = self.position
         self._direction = 0
@@ -128,12 +109,7 @@ class ForceControlledTool:
         self.strength = min(100.0, max(0.0, strength))
 
     def press(self, position: SheetPosition, direction: int) -> None:
-        """Press or pull; an engaged tool is released first.
-
-        Args:
-            position: fractions (across, down) of the sheet, clamped to it.
-            direction: 1 to press, -1 to pull.
-        """
+        """Press in direction 1, pull in direction -1; an engaged tool is released first."""
         if len(self._pending) > 1 and self._pending[-1] is None:
             # Discard a pending click, such as one in a paused session.
             self._pending.pop()
@@ -221,19 +197,8 @@ class PositionControlledTool:
     """A tool whose tip follows the pointer: at a given depth during a press, otherwise above the sheet.
 
     Between frames the tip moves in a straight line, up and down within `RISE_TIME_S`, and by at most the stride of its
-    shape per step. A grip begins when the tip reaches its depth, and ends with the release.
-
-    Args:
-        probe: probe with the instrument and the friction; a friction other than rough is 0 in quasi-static sessions.
-        plan: plan of the session.
-        start: position before the pointer moves.
-
-    Attributes:
-        strength: depth of a press [% of the largest depth]; negative to lift a grip.
-        position: current position of the tip, fractions (across, down) of the sheet.
-        target: goal of the tip, fractions (across, down) of the sheet.
-        height: current height of the lowest point of the tip above the sheet at rest [m].
-        grid: time grid of the session, to be replaced when a changed material changes the step.
+    shape per step. A grip begins when the tip reaches its depth, and ends with the release. A friction of the probe
+    other than rough is 0 in quasi-static sessions.
     """
 
     def __init__(self, probe: Probe, plan: Plan, start: SheetPosition = CENTRE) -> None:
@@ -246,7 +211,7 @@ class PositionControlledTool:
         if plan.scene.time.at_rest and friction != "rough":
             friction = 0.0
         self._probe = Probe(path=((0.0, *start, self._hover_height),), friction=friction, instrument=probe.instrument)
-        # The initial depth is the radius of the tip.
+        # Depth of a press [% of the largest depth], negative to lift a grip; initially the radius of the tip.
         self.strength = min(100.0, 100 * self._radius / self._max_depth)
         self._press_strength = self.strength
         self.reset()
@@ -254,7 +219,7 @@ class PositionControlledTool:
     def reset(self) -> None:
         """Discard the recorded keyframes, and return to the initial position."""
         self.position = self.target = self._start
-        self.height = self._hover_height
+        self.height = self._hover_height  # of the lowest point of the tip above the sheet at rest [m]
         self.engaged = self._grip_requested = False
         # Start of the current grip, and intervals of earlier grips [s].
         self._grip_start: float | None = None
@@ -281,12 +246,7 @@ class PositionControlledTool:
         self.strength = min(100.0, max(-100.0 if self._grip_requested else 0.0, strength))
 
     def press(self, position: SheetPosition, direction: int) -> None:
-        """Press or grip.
-
-        Args:
-            position: fractions (across, down) of the sheet, clamped to it.
-            direction: 1 to press, -1 to grip.
-        """
+        """Press in direction 1, grip in direction -1."""
         self.release()
         self.engaged, self._grip_requested, self._press_strength = True, direction < 0, self.strength
         self.move(position)

@@ -18,16 +18,7 @@ from taichi_msm.scene.render import AnyCamera, Render
 
 
 class Viewport:
-    """Camera, light and mesh display of a session.
-
-    Args:
-        renderer: renderer of a scene with the initial settings.
-        play: whether a moving camera of the scene moves; otherwise it stays at its initial pose.
-
-    Attributes:
-        render: current drawing settings.
-        view: current pose and projection of the main camera.
-    """
+    """Camera, light and mesh display of a session; with `play`, a moving camera of the scene moves."""
 
     def __init__(self, renderer: Renderer, *, play: bool = False) -> None:
         self._renderer, self._plays, self._time = renderer, play, 0.0
@@ -65,12 +56,7 @@ class Viewport:
         return self.render
 
     def turn(self, right: float, down: float) -> None:
-        """Orbit the camera as if the near side of the tissue were dragged; the picture's height is half a turn.
-
-        Args:
-            right: distance to the right [px].
-            down: distance downwards [px].
-        """
+        """Orbit the camera as if the near side of the tissue were dragged [px]; the picture's height is half a turn."""
         angle = math.pi / self.render.size[1]
         scene = self._renderer.scene.model_copy(update={"render": self.render})
         self.set_camera(orbit_camera(pinhole(scene, self._time), -right * angle, down * angle))
@@ -87,15 +73,7 @@ class Viewport:
         self.render = self.render.model_copy(update={"wireframe": not self.render.wireframe})
 
     def draw(self, positions: NDArray[Any], instruments: Sequence[Solid] = ()) -> Picture:
-        """Draw the sheet and the instruments.
-
-        Args:
-            positions: positions of the mass points [m], shape (rows, cols, 3).
-            instruments: instruments placed in the scene.
-
-        Returns:
-            Picture, shape (height, width, 3).
-        """
+        """Draw the sheet, with positions of the mass points [m], shape (rows, cols, 3), and the instruments."""
         return self._renderer.draw(Shot(positions, self.view, instruments), self.render)
 
     def project(self, point: NDArray[np.floating]) -> tuple[float, float] | None:
