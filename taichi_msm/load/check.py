@@ -86,8 +86,7 @@ def _check_combinations(
 def check_scene(scene: Plan | Scene | Mapping[str, Any], maps: Maps | None = None) -> Plan:
     """Validate a scene, except for the image file of a `Scene`, and plan it for a CPU; a plan is returned unchanged.
 
-    `maps` are the images of the scene's maps, by key; None reads them from their files. A SceneError contains all
-    problems.
+    `maps` are the images of the scene's maps, by key; None reads them from their files.
     """
     if isinstance(scene, Plan):
         return scene

@@ -63,10 +63,7 @@ def write_text(
 
 
 def mark_tool(picture: Picture, pixel: tuple[float, float], *, pulls: bool) -> None:
-    """Draw a ring around a pixel (x, y) into a picture, shape (height, width, 3), in place; yellow if the tool pulls.
-
-    The pixel may be outside of the picture.
-    """
+    """Draw a ring around a pixel (x, y) into a picture, shape (height, width, 3), in place; yellow for a pull."""
     radius = picture.shape[0] * (1 / 50)
     reach = int(radius) + 4
     left, top = max(0, int(pixel[0]) - reach), max(0, int(pixel[1]) - reach)
