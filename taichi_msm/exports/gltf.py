@@ -54,7 +54,6 @@ Numbers = NDArray[Any]
 
 
 def _write_run(run: FinishedRun, folder: Path, progress: ProgressCallback) -> list[str]:
-    """Write the animated surface with its picture, the tools and cameras."""
     positions, picture = run.positions(), picture_png(run)
     # A target has differences of positions and normals, float32.
     target_bytes = 2 * 3 * 4 * positions[0, ..., 0].size

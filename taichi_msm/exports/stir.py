@@ -52,7 +52,6 @@ Pixels = NDArray[np.int64]
 
 
 def _write_run(run: FinishedRun, folder: Path, progress: ProgressCallback) -> list[str]:
-    """Write the videos, marked tracks and cameras of a run."""
     if not outputs.is_pyav_installed():
         raise NotInstalledError(f"--format {outputs.PYAV_NOT_INSTALLED.replace('mp4', FORMAT_NAME, 1)}")
     runs = [replace(run, camera=side) for side in CAMERAS]

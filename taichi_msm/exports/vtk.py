@@ -41,7 +41,6 @@ Array = NDArray[np.floating]
 
 
 def _write_run(run: FinishedRun, folder: Path, progress: ProgressCallback) -> list[str]:
-    """Write the surface of every frame, the collection and the picture."""
     positions, picture = run.positions(), picture_png(run)
     run.require_same_pictures(drawn=False)
     plan, rest = make_plan(run.scene), rest_positions(run.scene.sheet)

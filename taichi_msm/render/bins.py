@@ -106,7 +106,6 @@ def _bin_range(cell, size, bounds: ti.template()):
 
 @ti.kernel
 def _count_cells(cells: ti.i32, size: ti.i32, columns: ti.i32, bounds: Integers, counts: Integers):
-    """Count the cells of every bin."""
     ti.loop_config(serialize=True)
     for cell in range(cells):
         left, right, top, bottom = _bin_range(cell, size, bounds)

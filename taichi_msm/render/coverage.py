@@ -231,7 +231,6 @@ def intersect_instrument(x, y, index, uniforms: ti.template(), shapes: ti.templa
 
 @ti.func
 def _cover_tile_with_instrument(entry, x, y, index, band: ti.template()):
-    """Cover a tile of samples with an instrument."""
     plane, samples = ti.static((band.config.plane, band.samples))
     depth, n_x, n_y, n_z = intersect_instrument(x, y, index, band.uniforms, band.config.shapes)
     visible = (geometry.w_at(depth, band.uniforms) > band.near) & (depth < samples[entry + plane.depth])
