@@ -80,16 +80,7 @@ class Derivatives:
 
 
 def scene_derivatives(plan: Plan, gradient: SheetGradient, loads: LoadGradient) -> Derivatives:
-    """Apply the chain rule to the derivatives with respect to the coefficients and the loads of a sheet.
-
-    Args:
-        plan: plan of the differentiated run, with a stiffness map.
-        gradient: derivatives with respect to the coefficients of the sheet.
-        loads: derivatives with respect to the loads, already by the keys of the scene.
-
-    Returns:
-        Derivatives with respect to the numbers and maps of the scene.
-    """
+    """Apply the chain rule to derivatives by the coefficients and the loads of a sheet with a stiffness map."""
     material, kind = plan.material, plan.scene.kind
     assert material.factors is not None
     by_coefficient = _coefficient_gradient(plan, gradient)
@@ -164,17 +155,10 @@ def _material_numbers(scene: Scene) -> Iterator[tuple[str, float]]:
     if tissue is None:
         static, dynamic = ["springs.structural", "springs.shear", "springs.virtual"], ["sheet.mass", "damping"]
     else:
-        foundation = ["foundation"]
+        foundation, laws = ["foundation"], _law_keys("stiffening", tissue.stiffening)
         if isinstance(tissue.foundation, Foundation):
             foundation = ["foundation.young", "foundation.depth", *_law_keys("foundation", tissue.foundation)]
-        names = [
-            "young",
-            "thickness",
-            *foundation,
-            "pretension",
-            "bending",
-            *_law_keys("stiffening", tissue.stiffening),
-        ]
+        names = ["young", "thickness", *foundation, "pretension", "bending", *laws]
         static, dynamic = [f"tissue.{name}" for name in names], ["tissue.density", "tissue.damping"]
     for key in static if scene.time.at_rest else static + dynamic:
         value = attrgetter(key)(scene)
@@ -197,11 +181,7 @@ def _with_value(section: Any, key: str, value: complex) -> Any:
 
 
 class LoadGradient:
-    """Derivatives with respect to the loads, accumulated over blocks of steps.
-
-    Attributes:
-        by_key: derivatives by key, as in `Derivatives.numbers`.
-    """
+    """Derivatives with respect to the loads, by the keys of `Derivatives.numbers`, accumulated over blocks of steps."""
 
     def __init__(self, plan: Plan) -> None:
         self._plan = plan
@@ -217,13 +197,10 @@ class LoadGradient:
             self.by_key[f"probes.{index}.at"] = np.zeros((*np.shape(probe.at)[:-1], 2))
 
     def add(self, schedule_of: Callable[[Plan], Schedule], by_slot: Array, times: tuple[float, float]) -> None:
-        """Add the derivatives of a block of steps.
+        """Add the derivatives of a block of steps, whose loads are in a time interval [s].
 
-        Args:
-            schedule_of: function from a plan with other loads to the schedule of these steps.
-            by_slot: derivatives with respect to the force (3) and the control point (2) of every slot, shape (steps,
-                slots, 5).
-            times: time interval of the block's loads [s]; only the keyframes that affect it are evaluated.
+        `schedule_of` returns the schedule of these steps for a plan with other loads. `by_slot` are the derivatives
+        with respect to the force (3) and the control point (2) of every slot, shape (steps, slots, 5).
         """
         height, width = self._plan.scene.sheet.size
         for index, slots in self._slots.items():

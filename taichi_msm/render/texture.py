@@ -14,19 +14,10 @@ from taichi_msm.scene.scene import Scene
 
 
 def load_texture(scene: Scene, sha256: str | None = None) -> NDArray[np.uint8]:
-    """Read the scene's picture: upright, in 8-bit RGB, cropped to the scene's region.
+    """Read the scene's picture: upright, in 8-bit RGB, cropped to the scene's region, shape (height, width, 3).
 
-    Only the first picture of a file is read. Transparent pixels are composited onto the scene's background.
-
-    Args:
-        scene: scene with the name of the picture and its region.
-        sha256: required SHA-256 of the file, in hexadecimal; any if None.
-
-    Returns:
-        Colours, shape (height, width, 3).
-
-    Raises:
-        SceneError: when there is no picture, or it is invalid.
+    Only the first picture of a file is read. Transparent pixels are composited onto the scene's background. A missing
+    or invalid picture, or one with another SHA-256 than `sha256`, raises a SceneError.
     """
     if scene.image is None:
         raise SceneError(["image: no picture is named"])
