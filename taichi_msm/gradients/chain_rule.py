@@ -1,10 +1,10 @@
 """Chain rule from the coefficients of a sheet to the numbers of its scene.
 
 Closed forms lead from the scene to a `Material` (`derive` of every term), and on to the coefficients of a time step
-(`verlet.coefficients`). Complex steps differentiate them, exactly but for rounding: f(x + i h) is f(x) + i h f'(x) with
-an h so small that its square vanishes. Loads are linear in their percents and in the components of the force, control
-points in their keyframes. The derivative with respect to one of these values therefore follows from a schedule with 1
-for this value and 0 for all others.
+(`Plan.step_coefficients`). Complex steps differentiate them, exactly but for rounding: f(x + i h) is f(x) + i h f'(x)
+with an h so small that its square vanishes. Loads are linear in their percents and in the components of the force,
+control points in their keyframes. The derivative with respect to one of these values therefore follows from a schedule
+with 1 for this value and 0 for all others.
 """
 
 from __future__ import annotations
@@ -21,7 +21,6 @@ from pydantic import BaseModel
 from taichi_msm.model.loads import Schedule
 from taichi_msm.model.plan import Plan, ProbeSegment
 from taichi_msm.model.tool_force import control_points
-from taichi_msm.model.verlet import coefficients
 from taichi_msm.scene.scene import Scene
 from taichi_msm.scene.section import Section
 from taichi_msm.scene.sheet import Foundation
@@ -107,7 +106,7 @@ def _sheet_coefficients(plan: Plan, scene: Scene) -> NDArray[Any]:
     """Return the coefficients of a sheet, real or complex, in the order of `_coefficient_gradient`."""
     material = derive_material(scene, {})
     springs = [material.across, material.down, material.shear, material.tension]
-    steps = () if scene.time.at_rest else coefficients(replace(plan, scene=scene, material=material))
+    steps = () if scene.time.at_rest else replace(plan, scene=scene, material=material).step_coefficients
     laws = [each or (0.0, 0.0) for each in (material.stiffening, material.virtual_stiffening)]
     return np.array([*springs, material.virtual, material.bending, *laws[0], *laws[1], *steps])
 
@@ -133,7 +132,7 @@ def _coefficient_gradient(plan: Plan, gradient: SheetGradient) -> Array:
     for law, (by_lock, by_factor) in laws:
         derivatives += [_from_logarithm(by_lock, law.lock), by_factor] if law else [0.0, 0.0]
     if not plan.scene.time.at_rest:
-        _, gain, first_gain = coefficients(plan)
+        _, gain, first_gain = plan.step_coefficients
         derivatives += [gradient.keep, gradient.gain / gain, gradient.first_gain / first_gain]
     return np.array(derivatives)
 
