@@ -17,7 +17,6 @@ from collections.abc import Callable
 from functools import cache
 from typing import Any, NamedTuple
 
-from taichi_msm.arithmetic import Operations
 from taichi_msm.render import geometry
 from taichi_msm.render import uniforms as uni
 from taichi_msm.render.config import (
@@ -37,6 +36,7 @@ from taichi_msm.render.config import (
 from taichi_msm.render.lens_kernels import distorted_point
 from taichi_msm.render.undistortion import INVALID_COORDINATE
 from taichi_msm.shapes import SHAPES
+from taichi_msm.system.kernel_operations import KERNEL
 from taichi_msm.system.runtime import ti
 
 
@@ -202,7 +202,7 @@ def cover_cell(i, j, invertible, first, end, outline: ti.template(), band: ti.te
 @cache
 def _compile_ray(shape: str) -> Callable[..., Any]:
     """Return `Shape.build_ray` of a shape as a Taichi function."""
-    return ti.func(SHAPES[shape].build_ray(Operations(ti.sqrt, ti.log, ti.max, ti.min, ti.select, ti.func)))
+    return ti.func(SHAPES[shape].build_ray(KERNEL))
 
 
 @ti.func

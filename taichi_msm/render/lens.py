@@ -8,9 +8,9 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from taichi_msm.arithmetic import NUMPY
+from taichi_msm.dual import DUAL, Dual
 from taichi_msm.lenses import MODELS
-from taichi_msm.lenses.dual import DUAL, Dual
-from taichi_msm.lenses.model import NUMPY
 
 Array = NDArray[np.float64]
 

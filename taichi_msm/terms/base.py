@@ -234,17 +234,10 @@ class KernelConfig:
 
     @property
     def operations(self) -> Operations:
-        """The operations of Taichi for laws and shapes."""
-        ti, lanes = self.ti, self.lanes
+        """The operations of kernels, imported lazily as `ti`."""
+        from taichi_msm.system.kernel_operations import KERNEL
 
-        @ti.func
-        def log(values):
-            result = values
-            for lane in ti.static(range(lanes)):
-                result[lane] = ti.log(values[lane])
-            return result
-
-        return Operations(ti.sqrt, log, ti.max, ti.min, ti.select, ti.func)
+        return KERNEL
 
     def compile_law(self, law: Law, *, tense: bool) -> LawFunctions:
         """Return the functions of a law as Taichi functions.

@@ -13,13 +13,13 @@ import numpy as np
 import pytest
 
 from taichi_msm import load_scene
+from taichi_msm.arithmetic import NUMPY
 from taichi_msm.camera_files.calibration import Calibration
 from taichi_msm.camera_files.camera_file import CameraFileError
 from taichi_msm.camera_files.readers import read_calibration
 from taichi_msm.cli.main import main
 from taichi_msm.errors import SceneError
 from taichi_msm.lenses import MODELS
-from taichi_msm.lenses.model import NUMPY
 from taichi_msm.render.camera import view
 from taichi_msm.scene.camera import Camera
 from tests.golden import Messages
