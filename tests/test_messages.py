@@ -125,7 +125,7 @@ WITHOUT_MESSAGES = {
     "view/events.py",
 }
 CALLS_WITHOUT_MESSAGES = re.compile(
-    r"(re|textwrap)\.\w+|key|((click|options)\.)?\w*(option|argument|Option)|CalibrationReader|TrajectoryReader|Coefficient|Integrator"
+    r"(re|textwrap)\.\w+|key|((click|options)\.)?\w*(option|argument|Option)|CalibrationReader|TrajectoryReader|Coefficient|Integrator|Continuous"
 )
 
 
