@@ -280,7 +280,7 @@ def pyramid(texture: NDArray[np.uint8], *, minified: bool) -> tuple[NDArray[np.f
         and height of every level, shape (levels, 3). Both are read-only.
     """
     colours = np.ascontiguousarray(texture)
-    key = "pyramid", sha256(colours).digest(), colours.shape, minified
+    key = "pyramid", sha256(colours.data).digest(), colours.shape, minified
     texels, levels = cached_arrays(key, lambda: _build_pyramid(colours, minified))
     return texels, levels
 

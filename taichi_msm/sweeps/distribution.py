@@ -63,14 +63,11 @@ CONTINUOUS = {
     "normal": Continuous("normally distributed", ("mean", "standard deviation"), _normal, _deviation_fault),
 }
 
-_Continuous: Any = create_model(
-    "_Continuous",
-    __base__=Section,
-    **{
-        name: (Any, key(None, row.meaning, f"[{', '.join(row.parameters)}]: numbers, or lists of one shape"))
-        for name, row in CONTINUOUS.items()
-    },
-)
+_FIELDS: dict[str, Any] = {
+    name: (Any, key(None, row.meaning, f"[{', '.join(row.parameters)}]: numbers, or lists of one shape"))
+    for name, row in CONTINUOUS.items()
+}
+_Continuous: Any = create_model("_Continuous", __base__=Section, **_FIELDS)
 
 
 class Distribution(_Continuous):  # type: ignore[misc]
