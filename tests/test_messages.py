@@ -146,7 +146,8 @@ WITHOUT_MESSAGES = {
     "view/events.py",
 }
 CALLS_WITHOUT_MESSAGES = re.compile(
-    r"(re|textwrap)\.\w+|key|((click|options)\.)?\w*(option|argument|Option)|CalibrationReader|TrajectoryReader|Coefficient|LawKey"
+    r"(re|textwrap)\.\w+|key|((click|options)\.)?\w*(option|argument|Option)|CalibrationReader|TrajectoryReader|Coefficient"
+    r"|LawKey|Integrator|Continuous"
 )
 
 

@@ -1,10 +1,10 @@
 """Chain rule from the coefficients of a sheet to the numbers of its scene.
 
 Closed forms lead from the scene to a `Material` (`derive` of every term), and on to the coefficients of a time step
-(`verlet.coefficients`). Complex steps differentiate them, exactly but for rounding: f(x + i h) is f(x) + i h f'(x) with
-an h so small that its square vanishes. Loads are linear in their percents and in the components of the force, control
-points in their keyframes. The derivative with respect to one of these values therefore follows from a schedule with 1
-for this value and 0 for all others.
+(`Plan.step_coefficients`). Complex steps differentiate them, exactly but for rounding: f(x + i h) is f(x) + i h f'(x)
+with an h so small that its square vanishes. Loads are linear in their percents and in the components of the force,
+control points in their keyframes. The derivative with respect to one of these values therefore follows from a schedule
+with 1 for this value and 0 for all others.
 """
 
 from __future__ import annotations
@@ -22,7 +22,6 @@ from taichi_msm.laws import law_of
 from taichi_msm.model.loads import Schedule
 from taichi_msm.model.plan import Plan, ProbeSegment
 from taichi_msm.model.tool_force import control_points
-from taichi_msm.model.verlet import coefficients
 from taichi_msm.scene.scene import Scene
 from taichi_msm.scene.section import Section
 from taichi_msm.scene.sheet import Foundation
@@ -99,7 +98,7 @@ def _sheet_coefficients(plan: Plan, scene: Scene) -> NDArray[Any]:
     """Return the coefficients of a sheet, real or complex, in the order of `_coefficient_gradient`."""
     material = derive_material(scene, {})
     springs = [material.across, material.down, material.shear, material.tension]
-    steps = () if scene.time.at_rest else coefficients(replace(plan, scene=scene, material=material))
+    steps = () if scene.time.at_rest else replace(plan, scene=scene, material=material).step_coefficients
     laws = (law for law in (material.stiffening, material.virtual_stiffening) if law)
     of_laws = [number for law in laws for number in (law.scale, *law.shape)]
     return np.array([*springs, material.virtual, material.bending, *of_laws, *steps])
@@ -127,7 +126,7 @@ def _coefficient_gradient(plan: Plan, gradient: SheetGradient) -> Array:
         if law:
             derivatives += [_from_logarithm(by_numbers[0], law.scale), *by_numbers[1 : 1 + law.law.shape_count]]
     if not plan.scene.time.at_rest:
-        _, gain, first_gain = coefficients(plan)
+        _, gain, first_gain = plan.step_coefficients
         derivatives += [gradient.keep, gradient.gain / gain, gradient.first_gain / first_gain]
     return np.array(derivatives)
 

@@ -21,7 +21,6 @@ from taichi_msm.gradients import kernel_motion as kernels
 from taichi_msm.gradients.chain_rule import LoadGradient, SheetGradient
 from taichi_msm.model.loads import average_loads
 from taichi_msm.model.plan import Plan
-from taichi_msm.model.verlet import coefficients
 from taichi_msm.solver.arrays import SheetLayout, from_lanes, to_lanes
 from taichi_msm.solver.backoff import Backoff
 from taichi_msm.solver.bands import MOMENT_ROWS
@@ -145,7 +144,7 @@ class MotionAdjoint:
         them.
         """
         grid, layout = self.plan.grid, self.layout
-        _, gain, _ = coefficients(self.plan)
+        gain = self.plan.step_coefficients.gain
         start = gain * self.plan.mobility[..., None] * by_frame[-1]
         for c in range(3):
             # p, an empty buffer, and q.
@@ -178,7 +177,7 @@ class MotionAdjoint:
                 pause()
         if first == 0:
             # The first step has another gain.
-            by_slot[0] *= table[0, GAIN] / coefficients(self.plan)[1]
+            by_slot[0] *= table[0, GAIN] / self.plan.step_coefficients.gain
         if not self.plan.slots:
             return np.zeros(2)
         loads.add(lambda plan: average_loads(plan, first, end - first), by_slot, (first * h - h, end * h))

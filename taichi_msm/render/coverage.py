@@ -36,7 +36,8 @@ from taichi_msm.render.config import (
 from taichi_msm.render.lens_kernels import distorted_point
 from taichi_msm.render.undistortion import INVALID_COORDINATE
 from taichi_msm.shapes import SHAPES
-from taichi_msm.system.runtime import kernel_operations, ti
+from taichi_msm.system.kernel_operations import KERNEL
+from taichi_msm.system.runtime import ti
 
 
 class Cell(NamedTuple):
@@ -191,7 +192,7 @@ def cover_cell(i, j, invertible, first, end, outline: ti.template(), band: ti.te
 @cache
 def _compile_ray(shape: str) -> Callable[..., Any]:
     """Return `Shape.build_ray` of a shape as a Taichi function."""
-    return ti.func(SHAPES[shape].build_ray(kernel_operations()))
+    return ti.func(SHAPES[shape].build_ray(KERNEL))
 
 
 @ti.func

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from taichi_msm.arithmetic import NUMPY
-from taichi_msm.dual import Dual, dual_operations
+from taichi_msm.dual import DUAL, Dual
 from taichi_msm.lenses import MODELS
 
 Array = NDArray[np.float64]
@@ -74,7 +74,7 @@ class Lens(NamedTuple):
         return np.where(is_converged[..., None], points, np.nan)
 
     def _distort_with_jacobian(self, points: Array) -> tuple[Array, Array]:
-        distort = MODELS[self.model].build(dual_operations(NUMPY))
+        distort = MODELS[self.model].build(DUAL)
         unit = np.eye(2).reshape(2, 2, *(1,) * (points.ndim - 1))
         x, y = (Dual(points[..., n], np.broadcast_to(unit[n], (2, *points.shape[:-1]))) for n in (0, 1))
         distorted = distort(x, y, *self.coefficients)

@@ -11,33 +11,14 @@ from typing import Any
 from taichi_msm.lenses import MODELS
 from taichi_msm.render import uniforms as uni
 from taichi_msm.render.undistortion import INVALID_COORDINATE
-from taichi_msm.system.runtime import kernel_operations, ti
-
-# The arctangent halves the angle HALVINGS times, and sums the power series of the remaining angle, whose terms have the
-# divisors SERIES, smallest term first.
-HALVINGS = 3
-SERIES = [(-1.0) ** n * (2 * n + 1) for n in reversed(range(12))]
-
-
-@ti.func
-def _arctangent(tangent):
-    """Return the angle of a tangent, 0 to pi / 2; GPUs have no arctangent in f64."""
-    half_tangent = tangent
-    for _ in ti.static(range(HALVINGS)):
-        half_tangent = half_tangent / (1.0 + ti.sqrt(1.0 + half_tangent * half_tangent))
-    square = half_tangent * half_tangent
-    # 1 and 0 in the precision of the argument; a quotient of constants would be f32.
-    unit = half_tangent * 0.0 + 1.0
-    total = half_tangent * 0.0
-    for divisor in ti.static(SERIES):
-        total = unit / divisor + square * total
-    return total * half_tangent * 2.0**HALVINGS
+from taichi_msm.system.kernel_operations import KERNEL
+from taichi_msm.system.runtime import ti
 
 
 @cache
 def compile_lens(lens: str) -> Callable[..., Any]:
     """Wrap the formula of a lens model for kernels."""
-    return ti.func(MODELS[lens].build(kernel_operations()._replace(arctan=_arctangent)))
+    return ti.func(MODELS[lens].build(KERNEL))
 
 
 @ti.func

@@ -45,13 +45,13 @@ class Renderer:
 
     def __init__(self, scene: Scene, texture: NDArray[np.uint8] | None = None) -> None:
         self._custom_texture = texture
-        self._cached_texture: tuple[object, NDArray[np.uint8]] | None = None
         self._rasterizers: dict[tuple[object, ...], Rasterizer] = {}
         self.restart(scene)
 
     def restart(self, scene: Scene) -> None:
         """Replace the scene, and discard its rasterisers."""
         self._rasterizers.clear()
+        self._texture = self._custom_texture
         self.scene, self.view = scene, view_at(scene, 0.0)
         names = scene.render.all_cameras
         self._has_moving_camera = any(is_moving(scene, name) for name in names)
@@ -172,7 +172,9 @@ class Renderer:
             from taichi_msm.render.rasterizer import Rasterizer, drawing_config
 
             scene = self.scene if style is None else self.scene.model_copy(update={"render": style})
-            texture = self._texture() if picture else np.zeros((1, 1, 3), np.uint8)
+            texture = np.zeros((1, 1, 3), np.uint8)
+            if picture:
+                texture = self._texture = load_texture(self.scene) if self._texture is None else self._texture
             config = drawing_config(scene, picture=picture, labels=labels, lens=view.lens_model)
             self._rasterizers[key] = Rasterizer(scene, texture, config)
         return self._rasterizers[key]
@@ -180,12 +182,3 @@ class Renderer:
     def _key(self, style: Render, *, picture: bool, labels: Collection[str] = (), view: View) -> tuple[object, ...]:
         """Return the cache key of a rasteriser: all settings that differ among the rasterisers of a scene."""
         return picture, frozenset(labels), view.optics, style.shading, style.wireframe, self.scene.shapes
-
-    def _texture(self) -> NDArray[np.uint8]:
-        """Return the texture, loaded again only if the scene names another picture."""
-        if self._custom_texture is not None:
-            return self._custom_texture
-        source = self.scene.image, self.scene.region, self.scene.render.background
-        if self._cached_texture is None or self._cached_texture[0] != source:
-            self._cached_texture = source, load_texture(self.scene)
-        return self._cached_texture[1]

@@ -18,6 +18,8 @@ removes the share uniforms.SHADE / r^2 of the light.
 Mipmaps filter the texture, at 1, 1/2, 1/4, ... of its size, so that a sample of many texels is their mean.
 """
 
+from hashlib import sha256
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -25,6 +27,7 @@ from taichi_msm.render import uniforms as uni
 from taichi_msm.render.config import INFINITY, dot, sample_centres, triple, undistorted_centres
 from taichi_msm.render.geometry import line_of_sight, w_at
 from taichi_msm.render.labels import label_channels
+from taichi_msm.system.array_cache import cached_arrays
 from taichi_msm.system.runtime import ti
 
 
@@ -258,8 +261,15 @@ def pyramid(texture: NDArray[np.uint8], *, minified: bool) -> tuple[NDArray[np.f
     """Build the mipmap levels of a texture, shape (height, width, 3), only the first unless `minified`.
 
     Return the texels of all levels, row by row, each red + 256 green + 65536 blue, which f32 represents exactly; and
-    start, width and height of every level, shape (levels, 3).
+    start, width and height of every level, shape (levels, 3); both read-only.
     """
+    colours = np.ascontiguousarray(texture)
+    key = "pyramid", sha256(colours.data).digest(), colours.shape, minified
+    texels, levels = cached_arrays(key, lambda: _build_pyramid(colours, minified))
+    return texels, levels
+
+
+def _build_pyramid(texture: NDArray[np.uint8], minified: bool) -> tuple[NDArray[np.float32], NDArray[np.int32]]:
     level, texels, levels, first = texture, [], [], 0
     while True:
         height, width, _ = level.shape

@@ -25,6 +25,7 @@ from taichi_msm.accuracy.divergence import displacement_bound
 from taichi_msm.accuracy.mesh import MIN_POINTS_PER_SIDE, interpolate, with_points
 from taichi_msm.accuracy.time_step import max_norm
 from taichi_msm.errors import ProgressCallback
+from taichi_msm.integrators import INTEGRATORS
 from taichi_msm.load import cost
 from taichi_msm.model.plan import Plan
 from taichi_msm.model.time_grid import Precision
@@ -39,7 +40,6 @@ from taichi_msm.system import process
 from taichi_msm.system.runtime import Device
 
 PRECISIONS: tuple[Precision, ...] = ("f64", "f32")
-DIFFERENCES = ("central", "backward")
 
 # Number of timings of every setting, in turns with the other settings of its kind.
 ROUNDS = 5
@@ -60,7 +60,7 @@ class SteppingStudy:
         self._study, self._progress = study, progress
         self._plans = {
             difference: plan_variant(plan, with_time(plan.scene, damping_difference=difference, step="auto"))
-            for difference in DIFFERENCES
+            for difference in INTEGRATORS
         }
         self._dynamics: dict[str, Dynamics] = {}
         self._done, self._total = 0, 1
@@ -77,7 +77,7 @@ class SteppingStudy:
                 dynamics = opened.enter_context(closing(Dynamics(plan, self._device)))
                 dynamics.compile()
                 self._dynamics[precision] = dynamics
-            series = {difference: list(self._series(difference)) for difference in DIFFERENCES}
+            series = {difference: list(self._series(difference)) for difference in INTEGRATORS}
             finest = max(steps for counts in series.values() for steps in counts)
             self._total = 3 + ROUNDS * len(PRECISIONS) * sum(len(counts) for counts in series.values())
             frames = self._compute_reference(finest)

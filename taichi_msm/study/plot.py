@@ -20,6 +20,7 @@ from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 from matplotlib.transforms import offset_copy
 
 from taichi_msm.errors import printable
+from taichi_msm.integrators import INTEGRATORS
 from taichi_msm.plot_style import (
     BLUE,
     DPI,
@@ -39,7 +40,7 @@ from taichi_msm.study.result import DrawingMeasurement, Study
 from taichi_msm.system.compiler import compiler_label
 
 # Colours encode the damping difference, dashes and markers the precision.
-DIFFERENCE_COLOURS = {"central": BLUE, "backward": VERMILION}
+DIFFERENCE_COLOURS = dict(zip(INTEGRATORS, (BLUE, VERMILION, GREEN, PURPLE), strict=False))
 PRECISION_LINES: dict[str, dict[str, Any]] = {
     "f32": {"linestyle": "-", "marker": "o"},
     "f64": {"linestyle": (0, (3.5, 1.8)), "marker": "s"},
