@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from scipy.optimize import least_squares, root
 
 from taichi_msm.arithmetic import NUMPY
+from taichi_msm.laws.locking import Locking
 from taichi_msm.plot_style import (
     BLUE,
     DPI,
@@ -28,7 +29,7 @@ from taichi_msm.plot_style import (
     TWO_COLUMN_WIDTH,
     VERMILION,
 )
-from taichi_msm.terms.law import build_locking
+from taichi_msm.terms.law import build_law
 
 Floats = NDArray[np.float64]
 
@@ -56,14 +57,14 @@ def lattice_stress(a: float, b: float, g: float = 0.0, angle: float = 0.0, law: 
         angle: of the rows of springs to x [rad].
         law: `lock` and `factor` of `stiffening`.
     """
-    secant, end = build_locking(NUMPY).secant, 1 - law[1] ** -0.5
+    secant, shape = build_law(Locking(), NUMPY).secant, Locking().shape(law[1])
     stress = np.zeros(3)
     for (column, row), k in SPRINGS:
         x = column * np.cos(angle) - row * np.sin(angle)
         y = column * np.sin(angle) + row * np.cos(angle)
         now, rest = np.array([a * x + g * y, b * y]), np.hypot(column, row)
         length = np.hypot(*now)
-        pull = k * (length - rest) * secant((length / rest - 1) / law[0], end) / length
+        pull = k * (length - rest) * secant((length / rest - 1) / law[0], shape) / length
         stress += pull * np.array([now[0] * x, now[1] * y, now[0] * y])
     return stress
 

@@ -15,16 +15,25 @@ PyTorch is imported by `loader` only.
 from __future__ import annotations
 
 import json
+from bisect import bisect_right
+from collections.abc import Iterator
+from contextlib import contextmanager
+from copy import copy
+from itertools import accumulate
+from numbers import Integral
 from pathlib import Path
 from typing import Any, ClassVar, TypedDict
 
 import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
+from typing_extensions import Self
 
-from taichi_msm.errors import ArgumentError, FilesError, NotInstalledError
+from taichi_msm.errors import ArgumentError, FilesError, NotInstalledError, require_path
 from taichi_msm.runs.arrays import read_flo
 from taichi_msm.scene.outputs import OUTPUTS
+
+REPEAT = "remove what is left of this run, and run the sweep again"
 
 
 class Pair(TypedDict):
@@ -52,26 +61,60 @@ class _Split:
     outputs: ClassVar[tuple[str, ...]]  # required outputs of the runs
 
     def __init__(self, directory: str | Path, split: str, length: int, stride: int, camera: str) -> None:
-        self.directory, self._camera = Path(directory), camera
-        try:
-            content = json.loads((self.directory / "dataset.json").read_text(encoding="utf-8"))
-        except OSError as error:
-            fault = f"{self.directory / 'dataset.json'}: {error.strerror}"
-            raise FilesError(f"{fault}; name the folder that `taichi-msm sweep` wrote") from None
-        # Number ("run"), folder, split ("part") and varied values of each run.
-        self.runs: list[dict[str, Any]] = [run for run in content["runs"] if run["part"] == split]
-        if not self.runs:
+        require_path(directory)
+        require_path(camera, "camera", "take the name of a camera")
+        self.directory, self._camera, self._length, self._stride = Path(directory), camera, length, stride
+        path = self.directory / "dataset.json"
+        with _reading(path, "name the folder that `taichi-msm sweep` wrote"):
+            content = json.loads(path.read_text(encoding="utf-8"))
+            common = {key: content.get(key) for key in ("outputs", "frames", "size")}
+            runs = [{**common, **run} for run in content["runs"] if run["part"] == split]
             splits = ", ".join(sorted({run["part"] for run in content["runs"]})) or "none, as no run is complete"
+            self._select(runs)
+        if not runs:
             raise ArgumentError(f"split: {split!r} has no runs in {directory}; the splits are {splits}")
-        written = {Path(name) for name in content["outputs"]}
-        if missing := [name for name in self.outputs if Path(camera, OUTPUTS[name].result) not in written]:
-            remedy = f"run the sweep with set: {{output: [{', '.join(self.outputs)}]}}"
-            raise ArgumentError(f"directory: {self.directory / camera} has no {', '.join(missing)}; {remedy}")
-        self._size, self._length, self._stride = content["size"], length, stride
-        self._windows = max(0, (content["frames"] - length) // stride + 1)  # windows per run
+        files = [Path(camera, OUTPUTS[name].result) for name in self.outputs]
+        for run in runs:
+            folder = self.directory / run["folder"]
+            written = set(map(Path, run["outputs"]))
+            if missing := [name for name, file in zip(self.outputs, files, strict=True) if file not in written]:
+                remedy = f"run the sweep with set: {{output: [{', '.join(self.outputs)}]}}"
+                raise ArgumentError(f"directory: {folder / camera} has no {', '.join(missing)}; {remedy}")
+            if not folder.is_dir():
+                raise FilesError(f"{folder}: no such folder; {REPEAT}")
+        if not self.runs:
+            longest = max(run["frames"] for run in runs)
+            fault = f"frames: {length}; the longest run of {split!r} has {longest}"
+            raise ArgumentError(f"{fault}; take fewer, or a sweep of longer runs")
+
+    def _select(self, runs: list[dict[str, Any]]) -> None:
+        # Number ("run"), folder, split ("part"), values, frames and frame size [px] of each run with a window.
+        self.runs = [run for run in runs if run["frames"] >= self._length]
+        windows = [(run["frames"] - self._length) // self._stride + 1 for run in self.runs]
+        self._ends = [0, *accumulate(windows)]  # number of windows before each run, and in all
 
     def __len__(self) -> int:
-        return len(self.runs) * self._windows
+        return self._ends[-1]
+
+    @property
+    def sizes(self) -> list[tuple[int, int]]:
+        """Widths and heights of the frames [px], in the order of the runs."""
+        return list(dict.fromkeys((width, height) for width, height in (run["size"] for run in self.runs)))
+
+    def of_size(self, size: tuple[int, int]) -> Self:
+        """Return the part of this data set with frames of one size, for batches.
+
+        Args:
+            size: width and height of the frames [px], one of `sizes`.
+
+        Raises:
+            ArgumentError: when no run has frames of this size.
+        """
+        if not isinstance(size, (tuple, list)) or tuple(size) not in self.sizes:
+            raise ArgumentError(f"size: {size!r}; take one of {', '.join(map(str, self.sizes))}")
+        part = copy(self)
+        part._select([run for run in self.runs if tuple(run["size"]) == tuple(size)])
+        return part
 
     def loader(self, **options: Any) -> Any:
         """Return a `torch.utils.data.DataLoader` of this data set.
@@ -80,18 +123,25 @@ class _Split:
             **options: keyword arguments of `DataLoader`, such as batch_size, shuffle and num_workers.
 
         Raises:
+            ArgumentError: when the frames have several sizes, and batches are of more than one item.
             NotInstalledError: when PyTorch is not installed.
         """
+        is_batched = options.get("batch_size") not in (None, 1) and "collate_fn" not in options
+        if is_batched and len(self.sizes) > 1:
+            sizes = ", ".join(map(str, self.sizes))
+            raise ArgumentError(f"batch_size: frames of sizes {sizes} cannot be in one batch; use of_size(SIZE).loader")
         try:
             from torch.utils.data import DataLoader
         except ImportError:
             raise NotInstalledError("a loader needs PyTorch, which is not installed; pip install torch") from None
         return DataLoader(self, **options)
 
-    def _find(self, index: int) -> tuple[Path, int]:
-        """Return the folder of the camera, within that of the run, and the first frame of a window."""
-        run, window = divmod(range(len(self))[index], self._windows)
-        return self.directory / self.runs[run]["folder"] / self._camera, window * self._stride
+    def _find(self, index: int) -> tuple[dict[str, Any], Path, int]:
+        """Return a window's run, the folder of the camera in that of the run, and the first frame."""
+        index = range(len(self))[index]
+        number = bisect_right(self._ends, index) - 1
+        run, frame = self.runs[number], (index - self._ends[number]) * self._stride
+        return run, self.directory / run["folder"] / self._camera, frame
 
 
 class Pairs(_Split):
@@ -103,8 +153,8 @@ class Pairs(_Split):
         camera: name of the camera; "" for a scene with a single one.
 
     Raises:
-        ArgumentError: when the split has no runs, or the runs lack outputs.
-        FilesError: when dataset.json cannot be read.
+        ArgumentError: when the split has no runs, or the runs lack outputs or frames.
+        FilesError: when dataset.json cannot be read, or a run is missing; of items when a file cannot be read.
     """
 
     outputs = ("png", "flow", "occlusion", "depth")
@@ -113,9 +163,10 @@ class Pairs(_Split):
         super().__init__(directory, split, length=2, stride=1, camera=camera)
 
     def __getitem__(self, index: int) -> Pair:
-        folder, frame = self._find(index)
-        width, height = self.runs[index // self._windows].get("size", self._size)
-        flow = read_flo(folder / OUTPUTS["flow"].path(frame), (width, height)).transpose(2, 0, 1)
+        run, folder, frame = self._find(index)
+        path = folder / OUTPUTS["flow"].path(frame)
+        with _reading(path):
+            flow = read_flo(path, tuple(run["size"])).transpose(2, 0, 1)
         valid = np.abs(flow).max(axis=0) < 1e9  # Files mark unknown flow by 1e10 px.
         return {
             "first": _read_image(folder, "png", frame).transpose(2, 0, 1),
@@ -141,12 +192,15 @@ class Clips(_Split):
     outputs = ("png", "tracks")
 
     def __init__(self, directory: str | Path, split: str, frames: int = 24, camera: str = "") -> None:
+        if isinstance(frames, bool) or not isinstance(frames, Integral) or frames < 1:
+            raise ArgumentError(f"frames: {frames!r}; take a whole number, 1 or more")
         super().__init__(directory, split, length=frames, stride=frames, camera=camera)
 
     def __getitem__(self, index: int) -> Clip:
-        folder, first = self._find(index)
+        _, folder, first = self._find(index)
         frames = range(first, first + self._length)
-        with np.load(folder / OUTPUTS["tracks"].path()) as tracks:
+        path = folder / OUTPUTS["tracks"].path()
+        with _reading(path), np.load(path) as tracks:
             points, occluded = (tracks[name][:, frames] for name in ("points", "occluded"))
         return {
             "video": np.stack([_read_image(folder, "png", frame).transpose(2, 0, 1) for frame in frames]),
@@ -156,5 +210,16 @@ class Clips(_Split):
 
 
 def _read_image(folder: Path, output: str, frame: int) -> NDArray[Any]:
-    with Image.open(folder / OUTPUTS[output].path(frame)) as image:
+    path = folder / OUTPUTS[output].path(frame)
+    with _reading(path), Image.open(path) as image:
         return np.array(image)
+
+
+@contextmanager
+def _reading(path: Path, remedy: str = REPEAT) -> Iterator[None]:
+    """Return a context that converts exceptions to FilesErrors; damaged files raise many types."""
+    try:
+        yield
+    except Exception as error:
+        reason = (error.strerror or "cannot be read").lower() if isinstance(error, OSError) else "damaged"
+        raise FilesError(f"{path}: {reason}; {remedy}") from None

@@ -222,6 +222,22 @@ def is_real_array(array: NDArray[Any], shape: tuple[int, ...]) -> bool:
     return array.dtype.kind in "fiu" and array.shape == shape
 
 
+def require_type(value: Any, types: Any, name: str, expected: str) -> None:
+    """Raise an ArgumentError unless an argument of a library call has one of some types.
+
+    Args:
+        value: argument of any type.
+        types: type or types, as for `isinstance`.
+        name: its name in the message.
+        expected: allowed values, for the message.
+
+    Raises:
+        ArgumentError: when the argument has another type.
+    """
+    if not isinstance(value, types):
+        raise ArgumentError(f"{name}: {value!r}; take {expected}")
+
+
 def require_frame_count(frames: int) -> None:
     """Raise an ArgumentError unless a number of frames is a whole number, 0 or more."""
     if isinstance(frames, bool) or not isinstance(frames, Integral) or frames < 0:

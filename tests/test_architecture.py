@@ -13,8 +13,8 @@ PACKAGE = Path(__file__).parent.parent / "taichi_msm"
 # A module or a package imports from earlier lines, and a package from itself.
 LAYERS = [
     {"arithmetic", "errors", "plot_style", "version"},
-    {"system"},
-    {"images", "lenses", "shapes"},
+    {"dual", "system"},
+    {"images", "integrators", "laws", "lenses", "shapes"},
     {"camera_files"},
     {"scene"},
     {"model"},

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from benchmarks import child, dop853, page, process, race
+from benchmarks import child, coverage, dop853, page, process, race
 from benchmarks.stepping import PEERS, measure, numpy_
 from benchmarks.stepping.problem import Array
 from taichi_msm import load_scene
@@ -101,3 +101,10 @@ def test_dop853_solves_the_scene(root: Path, device: Device) -> None:
     plan = plan_of(load_scene(root / "scenes/figure-3.yaml", ["output=[]"])).with_grid(precision="f64")
     exact = frames_on(plan.with_grid(steps_per_frame=8 * plan.grid.steps_per_frame), device)
     assert max_norm(dop853.integrate(1e-5) - exact) < 1e-4 * max_norm(exact)
+
+
+def test_coverage_of_a_clamp(device: Device) -> None:
+    result = coverage.try_test(coverage.Kind("clamp", 120, waits=False), 1)
+    assert result.keys() == {"young", "lock", "rejected", "noted"}
+    for _, error in (result["young"], result["lock"]):
+        assert abs(error) < 4

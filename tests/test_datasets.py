@@ -5,6 +5,8 @@ from __future__ import annotations
 import importlib.util
 import json
 import pickle
+import re
+import shutil
 import sys
 from collections.abc import Iterator
 from pathlib import Path
@@ -113,6 +115,8 @@ def test_batches_of_a_loader(data_set: Path, torch: None) -> None:
 def test_invalid_data_set(data_set: Path, tmp_path: Path, message: Messages) -> None:
     with message.raises(ArgumentError, "'valid'"):
         Pairs(data_set, "valid")
+    with message.raises(ArgumentError, "camera: 3"):
+        Pairs(data_set, "train", 3)  # type: ignore[arg-type]
     with message.raises(FilesError, "dataset.json"):
         Pairs(tmp_path, "train")
     record = json.loads((data_set / "dataset.json").read_text())
@@ -122,6 +126,69 @@ def test_invalid_data_set(data_set: Path, tmp_path: Path, message: Messages) -> 
     (tmp_path / "dataset.json").write_text(json.dumps({**record, "runs": []}))
     with message.raises(ArgumentError, "split"):
         Pairs(tmp_path, "train")
+
+
+@pytest.fixture(scope="module")
+def mixed(root: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Runs of 3 and 5 frames, each with landscape and portrait frames, all for training."""
+    directory = tmp_path_factory.mktemp("mixed") / "data"
+    overrides = {"sheet.points": [21, 21], "render.tracks": 4, "render.supersample": 1, "render.shading": "none"}
+    overrides |= {"output": ["png", "depth", "flow", "occlusion", "tracks"]}
+    vary: dict[str, dict[str, Any]] = {
+        "time.duration": {"grid": [2 / 25, 4 / 25]},
+        "render.size": {"grid": [[64, 48], [48, 64]]},
+    }
+    scene = root / "scenes/sweeps/tracking-scene.yaml"
+    assert {row.status for row in sweep(scene, vary, directory, overrides=overrides, workers=1)} == {"complete"}
+    text = (directory / "dataset.json").read_text()
+    (directory / "dataset.json").write_text(re.sub('"part": "[a-z]*"', '"part": "train"', text))
+    return directory
+
+
+def test_runs_of_different_lengths(mixed: Path) -> None:
+    """n frames are n - 1 pairs, and the clips of each run come one after the other."""
+    pairs = Pairs(mixed, "train")
+    assert len(pairs) == 2 * (2 + 4)
+    folders = [0] * 2 + [1] * 2 + [2] * 4 + [3] * 4
+    for index, (run, frame) in enumerate(zip(folders, [*range(2)] * 2 + [*range(4)] * 2, strict=True)):
+        first = np.array(Image.open(mixed / f"runs/00000{run}/frames/000{frame}.png"))
+        assert np.array_equal(pairs[index]["first"], first.transpose(2, 0, 1))
+    assert [len(Clips(mixed, "train", frames)) for frames in (1, 2, 3, 4, 5)] == [16, 6, 4, 2, 2]
+
+
+def test_sizes_of_frames(mixed: Path, torch: None, message: Messages) -> None:
+    pairs = Pairs(mixed, "train")
+    assert pairs.sizes == [(64, 48), (48, 64)]
+    (wide,), (tall,) = (list(pairs.of_size(size).loader(batch_size=6)) for size in pairs.sizes)
+    assert (tuple(wide["flow"].shape), tuple(tall["flow"].shape)) == ((6, 2, 48, 64), (6, 2, 64, 48))
+    assert [len(batch["flow"]) for batch in pairs.loader(batch_size=1)] == [1] * 12
+    with message.raises(ArgumentError, "batch_size", "of_size"):
+        pairs.loader(batch_size=2)
+    with message.raises(ArgumentError, "size"):
+        pairs.of_size((64, 64))
+
+
+def test_clips_longer_than_any_run(mixed: Path, message: Messages) -> None:
+    with message.raises(ArgumentError, "frames: 6"):
+        Clips(mixed, "train", 6)
+    with message.raises(ArgumentError, "frames: 0"):
+        Clips(mixed, "train", 0)
+
+
+def test_missing_and_damaged_runs(mixed: Path, tmp_path: Path, message: Messages) -> None:
+    shutil.copytree(mixed, tmp_path / "data")
+    pairs, clips = Pairs(tmp_path / "data", "train"), Clips(tmp_path / "data", "train", 3)
+    (tmp_path / "data/runs/000001/tracks.npz").write_bytes(b"PK")
+    with message.raises(FilesError, "runs/000001"):
+        clips[1]
+    shutil.rmtree(tmp_path / "data/runs/000001")
+    with message.raises(FilesError, "runs/000001"):
+        pairs[2]
+    with message.raises(FilesError, "runs/000001"):
+        Pairs(tmp_path / "data", "train")
+    (tmp_path / "data/dataset.json").write_text("{")
+    with message.raises(FilesError, "dataset.json"):
+        Pairs(tmp_path / "data", "train")
 
 
 def test_pytorch_is_not_installed(data_set: Path, monkeypatch: pytest.MonkeyPatch, message: Messages) -> None:

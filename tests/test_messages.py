@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import ast
 import re
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -12,8 +13,10 @@ import pytest
 from taichi_msm.errors import ArgumentError, SceneError
 from taichi_msm.fitting.fit import fit
 from taichi_msm.load.scene_file import load_scene
-from taichi_msm.runs.simulation import Player
+from taichi_msm.runs.run import resume, run
+from taichi_msm.runs.simulation import Player, Simulation
 from taichi_msm.sweeps.spec import load_sweep
+from taichi_msm.sweeps.sweep import sweep
 from tests.golden import Messages, read
 from tests.scenes import scene
 
@@ -114,6 +117,24 @@ def test_invalid_options_of_fits(free: list[str], options: dict[str, object], me
         fit(made, observed, free, workers=1, **options)  # type: ignore[arg-type]
 
 
+CALLS: dict[str, Callable[[], object]] = {
+    "estimate_error": lambda: run("small.yaml", "out", estimate_error="no"),  # type: ignore[arg-type]
+    "overrides": lambda: run(scene(), "out", overrides="a=1"),
+    "started": lambda: run(scene(), "out", started="now"),  # type: ignore[arg-type]
+    "progress": lambda: resume("out", progress=3),  # type: ignore[arg-type]
+    "cores": lambda: Simulation(scene(), cores="two"),  # type: ignore[arg-type]
+    "executor": lambda: sweep("small.yaml", {}, "out", executor=3),  # type: ignore[arg-type]
+    "keys of a scene": lambda: Simulation({1: 2}),  # type: ignore[dict-item]
+    "number of 5001 digits": lambda: Simulation({**scene().model_dump(), "damping": 10**5000}),
+}
+
+
+@pytest.mark.parametrize("name", CALLS)
+def test_arguments_of_wrong_types(name: str, small: Path, message: Messages) -> None:
+    with message.raises((ArgumentError, SceneError), name.split()[0] if "of" not in name else ""):
+        CALLS[name]()
+
+
 # Modules whose texts are help, labels of plots and contents of files, and calls and names with such texts.
 WITHOUT_MESSAGES = {
     "__init__.py",
@@ -126,6 +147,7 @@ WITHOUT_MESSAGES = {
 }
 CALLS_WITHOUT_MESSAGES = re.compile(
     r"(re|textwrap)\.\w+|key|((click|options)\.)?\w*(option|argument|Option)|CalibrationReader|TrajectoryReader|Coefficient"
+    r"|LawKey|Integrator|Continuous"
 )
 
 

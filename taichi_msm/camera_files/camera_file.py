@@ -4,10 +4,9 @@ from __future__ import annotations
 
 import json
 import re
-from collections.abc import Iterable, Mapping
-from configparser import ConfigParser, DuplicateOptionError, DuplicateSectionError
-from configparser import Error as ConfigError
+from collections.abc import Iterable, Iterator, Mapping
 from functools import cached_property
+from itertools import islice
 from typing import Any
 
 import yaml
@@ -22,15 +21,14 @@ LENGTH_UNITS = {"m": 1.0, "mm": 1e-3}
 # Largest depth of nested values. Matrices are nested two or three deep.
 MAX_DEPTH = 20
 
-# Comments and empty lines, which may precede the first section of an ini file, or OpenCV's directive, no valid YAML.
-_COMMENTS = r"((?:[ \t]*(?:[#;][^\n]*)?\r?\n)*)"
-_INI = re.compile(_COMMENTS + r"[ \t]*\[[^\]\n=,]*\][ \t]*\r?\n" + _COMMENTS + r"[^\n]*=")
-_DIRECTIVE = re.compile(_COMMENTS + r"%YAML[^\n]*")
+# Largest length of a number in YAML. PyYAML converts 1:2:3 in quadratic time, and Python prints integers of up to 4300
+# digits.
+MAX_DIGITS = 1000
 
 # Errors of Python's and PyYAML's parsers for invalid content.
 _PARSER_ERRORS = (
     *(ArithmeticError, AttributeError, LookupError, RecursionError, SyntaxError, TypeError, ValueError),
-    *(ConfigError, yaml.YAMLError),
+    yaml.YAMLError,
 )
 
 
@@ -84,6 +82,11 @@ class CameraFile:
         return CameraFileError(f"{self.path}{'' if line is None else f':{line}'}: {fault}")
 
     @cached_property
+    def lines(self) -> list[tuple[int, str]]:
+        """Lines that are not empty, stripped, with their numbers from 1."""
+        return [(n, line) for n, raw in enumerate(self.text.splitlines(), 1) if (line := raw.strip())]
+
+    @cached_property
     def data(self) -> Entries:
         """Keys and values of YAML, JSON, XML or an ini file.
 
@@ -122,11 +125,21 @@ def _read(name: str, max_bytes: int) -> str:
 
 
 def _parse(text: str) -> Any:
-    if text.lstrip().startswith("<"):
+    start = text.lstrip()[:1]
+    if start == "<":
         return _xml(text)
-    if text.lstrip().startswith("{"):
+    if start == "{":
         return _json(text)
-    return _ini(text) if _INI.match(text) else _yaml(text)
+    header, entry = ([line for _, line in islice(_content(text), 2)] + ["", ""])[:2]
+    is_ini = header.startswith("[") and header.endswith("]") and not {*"=,"} & {*header} and "=" in entry
+    return _ini(text) if is_ini else _yaml(text)
+
+
+def _content(text: str) -> Iterator[tuple[int, str]]:
+    """Yield the lines that are neither empty nor comments, stripped, with their numbers from 1."""
+    for n, raw in enumerate(text.splitlines(), 1):
+        if (line := raw.strip()) and line[0] not in "#;":
+            yield n, line
 
 
 def _truncated(text: str, kind: str) -> _ContentError:
@@ -187,13 +200,16 @@ _Loader.add_constructor("tag:yaml.org,2002:python/tuple", lambda loader, node: l
 
 def _yaml(text: str) -> Any:
     """Parse YAML, also with OpenCV's directive in the first line, which is not valid YAML."""
-    text = _DIRECTIVE.sub(r"\1", text, count=1)
+    number, first = next(_content(text), (0, ""))
+    if first.startswith("%YAML"):
+        # Only empty lines and comments come before it.
+        text = "\n" * number + "".join(text.splitlines(keepends=True)[number:])
     # Nested aliases, deep nesting and huge files take unlimited time; no calibration has them.
     depth, max_events = 0, 200_000
     try:
         for count, event in enumerate(yaml.parse(text, _BaseLoader)):
             depth += isinstance(event, yaml.CollectionStartEvent) - isinstance(event, yaml.CollectionEndEvent)
-            if isinstance(event, yaml.AliasEvent) or depth > MAX_DEPTH or count > max_events:
+            if isinstance(event, yaml.AliasEvent) or depth > MAX_DEPTH or count > max_events or _is_too_long(event):
                 raise ValueError
         # The output of a ROS topic has a document for every message, all with equal content.
         return next(yaml.load_all(text, _Loader), None)
@@ -233,21 +249,22 @@ def _xml(text: str) -> Entries:
     return _entries(items)
 
 
+def _is_too_long(event: yaml.Event) -> bool:
+    """Return whether an event is a number of more than MAX_DIGITS characters."""
+    if not (isinstance(event, yaml.ScalarEvent) and event.implicit[0]):
+        return False
+    return len(event.value) > MAX_DIGITS and event.value[0] in "+-.0123456789"
+
+
 def _ini(text: str) -> Entries:
-    """Parse an ini file; its keys are in lower case."""
-    parser = ConfigParser(interpolation=None, inline_comment_prefixes=("#", ";"))
-    try:
-        parser.read_string(text)
-    except (DuplicateOptionError, DuplicateSectionError) as error:
-        name = error.option if isinstance(error, DuplicateOptionError) else error.section
-        raise _ContentError(f"{truncate(name)} is given twice; keep the right one", error.lineno) from None
-    headers: dict[str, int] = {}
-    keys: dict[str, dict[str, int]] = {}
-    section = ""
-    for n, line in enumerate(text.splitlines(), 1):
-        if header := re.match(r"\s*\[(.+)\]", line):
-            section = header[1]
-            headers[section] = n
-        elif entry := re.match(r"\s*([^#;=:]+?)\s*[=:]", line):
-            keys.setdefault(section, {}).setdefault(entry[1].lower(), n)
-    return Entries({name: Entries(parser[name], keys.get(name, {})) for name in parser.sections()}, headers)
+    """Parse an ini file; its keys are in lower case, and # or ; after a blank begin a comment."""
+    sections: list[tuple[str, list[tuple[str, str, int]], int]] = []
+    for n, line in _content(text):
+        content = re.split(r"\s[#;]", line, maxsplit=1)[0].rstrip()
+        if content.startswith("[") and content.endswith("]"):
+            sections.append((content[1:-1], [], n))
+        elif len(entry := re.split("[=:]", content, maxsplit=1)) == 2:
+            sections[-1][1].append((entry[0].strip().lower(), entry[1].strip(), n))
+        else:
+            raise _ContentError(f"{truncate(content)}: neither [SECTION] nor KEY = VALUE; correct the line", n)
+    return _entries((name, _entries(items), n) for name, items, n in sections)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Sequence
+from typing import NamedTuple
 
 from taichi_msm.camera_files.calibration import CalibrationReader
 from taichi_msm.camera_files.camera_file import CameraFile, listed
@@ -12,12 +13,14 @@ from taichi_msm.camera_files.opencv import read_camera
 from taichi_msm.camera_files.trajectory import Trajectory, TrajectoryReader, parse_numbers, pose_fault
 
 # A line of cameras.txt: id, model, width, height, parameters.
-CAMERA = re.compile(r"^(\d+)[ \t]+([A-Z_]+)[ \t]+(\d+)[ \t]+(\d+)((?:[ \t]+[-+.\deE]+)+)[ \t\r]*$", re.MULTILINE)
-
-# A line of images.txt: id, quaternion w, x, y, z and translation, camera, name.
-IMAGE = re.compile(r"^(\d+)((?:[ \t]+[-+.\deE]+){7})[ \t]+(\d+)[ \t]+(\S.*)$", re.MULTILINE)
+CAMERA = re.compile(r"(\d+)\s+([A-Z_]+)\s+(\d+)\s+(\d+)((?:\s+[-+.\deE]+)+)")
 
 POINT_ID = re.compile(r"-1|\d+")
+
+# Numbers in the names of images: a time, and the last number, which is matched in the reversed name. Longer numbers are
+# neither times nor counts.
+TIME = re.compile(r"(?:.*\D)?(\d{1,30}\.\d{1,30})")
+REVERSED_END = re.compile(r"\D*(\d{1,30})")
 
 # Models: the number of focal lengths, the lens model, and the number of its coefficients.
 MODELS = {
@@ -35,13 +38,14 @@ MODELS = {
 
 def _cameras(file: CameraFile) -> Sequence[Keys]:
     """Return the camera under OpenCV's keys, shifted by half a pixel: COLMAP's first pixel centre is (0.5, 0.5)."""
-    cameras = list(CAMERA.finditer(file.text))
-    lines = [1 + file.text.count("\n", 0, camera.start()) for camera in cameras]
-    for camera, line in zip(cameras, lines, strict=True):
-        if camera.groups()[1:] != cameras[0].groups()[1:]:
-            names = listed(camera[1] for camera in cameras)
-            raise file.fault(f"has several cameras, {names}; keep the line of one", line)
-    return [_camera(file, line, *camera.groups()[1:]) for camera, line in zip(cameras[:1], lines, strict=False)]
+    matches: list[tuple[int, re.Match[str]]] = []
+    for n, line in file.lines:
+        if match := CAMERA.fullmatch(line):
+            matches.append((n, match))
+            if match.groups()[1:] != matches[0][1].groups()[1:]:
+                names = listed(match[1] for _, match in matches)
+                raise file.fault(f"has several cameras, {names}; keep the line of one", n)
+    return [_camera(file, n, *match.groups()[1:]) for n, match in matches[:1]]
 
 
 def _camera(file: CameraFile, line: int, name: str, width: str, height: str, parameters: str) -> Keys:
@@ -59,29 +63,29 @@ def _camera(file: CameraFile, line: int, name: str, width: str, height: str, par
 
 def _read_images(file: CameraFile) -> Trajectory | None:
     """Read the poses, ordered by times or final numbers in the image names, else by name; None for another format."""
-    lines = [(n, line) for n, line in enumerate(file.text.splitlines(), 1) if line.strip() and line[0] != "#"]
+    lines = [(n, line) for n, line in file.lines if line[0] != "#"]
     if not lines or _image(lines[0][1]) is None:
         return None
     from scipy.spatial.transform import Rotation
 
     images, follows_image = [], False
     for n, line in lines:
-        if (match := _image(line)) is not None:
-            images.append((match[4], n, [float(word) for word in match[2].split()], match[3]))
+        if (image := _image(line)) is not None:
+            images.append((image.name, n, image.pose, image.camera))
         elif not (follows_image and _has_points(line.split())):
             raise file.fault(
                 "neither an image, IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME, nor points; export the model again",
                 n,
             )
-        follows_image = match is not None
+        follows_image = image is not None
     if len(cameras := {camera for *_, camera in images}) > 1:
         raise file.fault(f"has images of cameras {listed(sorted(cameras))}; keep those of one")
     stems = [name.rpartition(".")[0] or name for name, *_ in images]
     # Times as names, such as 1305031102.975304.png.
-    times = [float(match[1]) for stem in stems if (match := re.fullmatch(r"(?:.*\D)??(\d+\.\d+)", stem))]
+    times = [float(match[1]) for stem in stems if (match := TIME.fullmatch(stem))]
     has_times = len({*times}) == len(images)
-    ends = [re.search(r"(\d+)\D*$", stem) for stem in stems]
-    numbers: list[float] = times if has_times else [int(end[1]) for end in ends if end]
+    ends = [REVERSED_END.match(stem[::-1]) for stem in stems]
+    numbers: list[float] = times if has_times else [int(end[1][::-1]) for end in ends if end]
     if len({*numbers}) < len(images):
         images.sort()
         numbers = list(range(len(images)))
@@ -94,9 +98,21 @@ def _read_images(file: CameraFile) -> Trajectory | None:
     return Trajectory([row for _, row in poses], [n for n, _ in poses], has_times)
 
 
-def _image(line: str) -> re.Match[str] | None:
-    """Match the line of an image, which, unlike a line of points, does not end with a number."""
-    return None if parse_numbers(line.split()[-1:]) else IMAGE.match(line)
+class _Image(NamedTuple):
+    """Line of images.txt."""
+
+    pose: list[float]  # quaternion w, x, y, z and translation, from the world to the camera
+    camera: str
+    name: str
+
+
+def _image(line: str) -> _Image | None:
+    """Split the line of an image, which, unlike a line of points, does not end with a number."""
+    words = line.split(maxsplit=9)
+    pose = parse_numbers(words[1:8])
+    if pose is None or len(words) < 10 or not (words[0].isdecimal() and words[8].isdecimal()):
+        return None
+    return None if parse_numbers(line.split()[-1:]) else _Image(pose, words[8], words[9])
 
 
 def _has_points(words: Sequence[str]) -> bool:

@@ -59,7 +59,7 @@ def _camera(file: CameraFile, prefix: str, section: Entries) -> Keys:
 
 
 def _sort_key(name: object) -> tuple[int, str]:
-    match = re.search(r"\d+", str(name))
+    match = re.search(r"\d{1,18}", str(name))
     return int(match[0]) if match else 0, str(name)
 
 

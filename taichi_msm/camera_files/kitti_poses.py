@@ -10,23 +10,26 @@ COUNT = 12
 
 def _read(file: CameraFile) -> Trajectory | None:
     """Read the matrices; None for another format, without twelve numbers in the first line."""
-    lines = [(n, line.split()) for n, line in enumerate(file.text.splitlines(), 1)]
-    lines = [(n, words) for n, words in lines if words and not words[0].startswith("#")]
-    if not lines or len(lines[0][1]) != COUNT or parse_numbers(lines[0][1]) is None:
+    lines = [(n, line) for n, line in file.lines if line[0] != "#"]
+    if not lines or len(lines[0][1].split()) != COUNT or parse_numbers(lines[0][1].split()) is None:
         return None
     import numpy as np
     from scipy.spatial.transform import Rotation
 
-    rows: list[list[float]] = []
-    for n, words in lines:
-        numbers = parse_numbers(words)
+    poses: list[list[float]] = []
+    for n, line in lines:
+        numbers = parse_numbers(line.split())
         if numbers is None or len(numbers) != COUNT:
             raise file.fault("not twelve numbers, as in the first line; write twelve in each line", n)
-        matrix = np.array(numbers).reshape(3, 4)
-        rotation = matrix[:, :3]
-        if abs(rotation @ rotation.T - np.eye(3)).max() > NORM_TOLERANCE or np.linalg.det(rotation) < 0:
-            raise file.fault("its first three columns are not a rotation; write an orthonormal matrix", n)
-        rows.append([len(rows), *matrix[:, 3].tolist(), *Rotation.from_matrix(rotation).as_quat().tolist()])
+        poses.append(numbers)
+    matrices = np.array(poses).reshape(-1, 3, 4)
+    rotations = matrices[:, :, :3]
+    deviations = abs(rotations @ rotations.swapaxes(1, 2) - np.eye(3)).max(axis=(1, 2))
+    if (faults := (deviations > NORM_TOLERANCE) | (np.linalg.det(rotations) < 0)).any():
+        fault = "its first three columns are not a rotation; write an orthonormal matrix"
+        raise file.fault(fault, lines[int(faults.argmax())][0])
+    quaternions = Rotation.from_matrix(rotations).as_quat()
+    rows = np.column_stack([np.arange(len(poses)), matrices[:, :, 3], quaternions]).tolist()
     return Trajectory(rows, [n for n, _ in lines], has_times=False)
 
 

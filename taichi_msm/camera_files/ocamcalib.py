@@ -1,4 +1,7 @@
-"""calib_results.txt of OCamCalib: Scaramuzza's polynomial, with x down, y to the right and the axis backward."""
+"""calib_results.txt of OCamCalib: Scaramuzza's polynomial, with x down, y to the right and the axis backward.
+
+Its centre counts from 0, as in OpenCV; OCamCalib writes the centre of its MATLAB model minus 1.
+"""
 
 from __future__ import annotations
 
@@ -18,8 +21,7 @@ def _cameras(file: CameraFile) -> Sequence[Keys]:
     """Return the keys of the camera, if the file begins with the comment of OCamCalib."""
     if not file.text.lstrip().startswith("#polynomial coefficients"):
         return ()
-    lines = [(n, line.strip()) for n, line in enumerate(file.text.splitlines(), 1)]
-    rows = dict(zip(LINES, ((n, line) for n, line in lines if line and line[0] != "#"), strict=False))
+    rows = dict(zip(LINES, ((n, line) for n, line in file.lines if line[0] != "#"), strict=False))
     return [
         Keys(file, {name: line for name, (_, line) in rows.items()}, lines={name: n for name, (n, _) in rows.items()})
     ]

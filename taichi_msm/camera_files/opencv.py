@@ -11,7 +11,7 @@ from collections.abc import Sequence
 
 from taichi_msm.camera_files.calibration import Calibration, CalibrationReader, StereoPose, focal_fault
 from taichi_msm.camera_files.camera_file import listed
-from taichi_msm.camera_files.key_lookup import ROUNDING_TOLERANCE, Keys, fold
+from taichi_msm.camera_files.key_lookup import ROUNDING_TOLERANCE, Keys, flat, fold
 from taichi_msm.errors import truncate
 from taichi_msm.lenses import MODELS
 
@@ -19,7 +19,7 @@ from taichi_msm.lenses import MODELS
 _PICTURE = "(image|img|picture|frame|camera|cam)"
 # K, mtx, camera_matrix, intrinsics
 MATRIX = (
-    r"mtx|[km]|kmat(rix)?|intrinsics?(mat|matrix)?(mtx)?|"
+    r"mtx|[km]|cm|kmat(rix)?|intrinsics?(mat|matrix)?(mtx)?|"
     r"(camera|cam|calibration)(mat|matrix|mtx|k|intrinsics?)(mtx|matrix)?"
 )
 # D, dist, distortion_coefficients
@@ -27,17 +27,18 @@ COEFFICIENTS = (
     r"(camera|cam|lens)?(d|dist|distort|distortion)"
     r"(s|coeff?s?|coefficients?|params?|parameters?|vec|vector|mat|matrix|values)?"
 )
-# image_width, image_height; image_size, resolution
-WIDTH, HEIGHT = f"{_PICTURE}?(width|w)", f"{_PICTURE}?(height|h)"
+# image_width, image_height, or width and height in a section image_size; image_size, resolution
+WIDTH, HEIGHT = f"{_PICTURE}?(size)?(width|w)", f"{_PICTURE}?(size)?(height|h)"
 SIZE = f"{_PICTURE}?(size|resolution|res|dims?)"
 # distortion_model, lens_type; of these, keys whose value may also be the type of a device
 LENS = r"(camera|cam|lens|distortion|dist|projection|calibration|calib)?(model|type)(name|type)?|lens|projection"
 LENS_OR_DEVICE = r"lens|type|projection"
 # is_fisheye
 FISHEYE = r"(is|use)?fisheye(model)?"
-# R, rotation_matrix; T, tvec
-ROTATION = r"r|rot|rotation|rmat|(rot|rotation)(mat|matrix)"
-TRANSLATION = r"t|tvec|trans|translation|(trans|translation)(vec|vector)"
+# R, rotation_matrix; T, tvec; in a section for both cameras, such as stereo or extrinsics
+_BOTH = "(stereo)?(extrinsics?|params|parameters|calib|calibration|results?)?"
+ROTATION = rf"{_BOTH}(r|rot|rotation|rmat|(rot|rotation)(mat|matrix))"
+TRANSLATION = rf"{_BOTH}(t|tvec|trans|translation|(trans|translation)(vec|vector|mat|matrix))"
 
 # Other keys that could change the projection; an error unless empty or 0.
 UNSUPPORTED = "|".join(
@@ -46,7 +47,7 @@ UNSUPPORTED = "|".join(
         r".*(distort(?!ed)|distorsion|coef|radial|tangential|prism|fisheye|omni|mirror|polynom|skew).*",
         r"(lens|dist).*model.*|kc|[kps][1-6]|alpha|beta|lambda|tau[xy]?|tilt.*",
         # Camera matrix, but not the new or optimal one of rectified pictures.
-        r"(?!new|opt).*(cameramat|intrinsic).*|alphac|calibration",
+        r"(?!new|opt|rect).*(cameramat|intrinsic).*|alphac|calibration",
         # Size and processing of the pictures.
         rf"{_PICTURE}?(shape|dimensions?)|{_PICTURE}(size|resolution|width|height).*",
         r"binning|scale(factor)?|undistort(ed)?|rectified|roi|crop(ped|[xywh])?|offset[xy]",
@@ -77,6 +78,8 @@ def read_camera(keys: Keys) -> Calibration:
     if matrix is None:
         raise file.fault(f"has no known camera matrix; found {keys}; {_REMEDY}")
     name = keys.find(MATRIX)
+    if matrix[12:] == [0, 0, 0, 1] and matrix[3:12:4] == [0, 0, 0]:  # 4 x 4, for homogeneous coordinates
+        matrix = [*matrix[:3], *matrix[4:7], *matrix[8:11]]
     if len(matrix) != 9 or [matrix[n] for n in (1, 3, 6, 7, 8)] != [0, 0, 0, 0, 1] or min(matrix[::4]) <= 0:
         raise keys.fault(f"{name}: is not [fx, 0, cx, 0, fy, cy, 0, 0, 1]; write the camera matrix like that", name)
     (fx, _, cx), (_, fy, cy) = matrix[:3], matrix[3:6]
@@ -116,7 +119,9 @@ def read_pose(keys: Keys) -> StereoPose | None:
 def _require_agreement(keys: Keys, focal: Sequence[float], centre: Sequence[float]) -> None:
     """Require that other keys of focal lengths and principal point agree with the camera matrix."""
     expected = {"fx": focal[:1], "fy": focal[1:], "cx": centre[:1], "cy": centre[1:]}
-    expected |= {"focal(length)?s?|f": focal, "principalpoint|pp|centre|center": centre}
+    # F with nine numbers is the fundamental matrix.
+    is_matrix = any(len(flat(value)) > len(focal) for value in keys.values("f").values())
+    expected |= {f"focal(length)?s?{'' if is_matrix else '|f'}": focal, "principalpoint|pp|centre|center": centre}
     for spelling, values in expected.items():
         numbers = keys.numbers(spelling)
         if numbers and not all(

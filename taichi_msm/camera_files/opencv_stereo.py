@@ -19,6 +19,16 @@ MARKS = (
     (r"(.+?)_?0|cam(?:era)?_?0_(.+)", r"(.+?)_?1|cam(?:era)?_?1_(.+)"),
 )
 
+# Names of the section of a camera, without numbers.
+SECTION = re.compile(
+    r"(?:camera|cam)?_?(left|right)_?(?:camera|cam)?(?:_?(?:intrinsics|calibration|calib|params|parameters))?", re.I
+)
+
+# Names of results for both cameras: the fundamental matrix F, and the free parameter of stereoRectify. Others of its
+# results have names of coefficients and of ROS, but other numbers of values: projections and regions.
+SHARED = {"f", "alpha"}
+RECTIFICATION = {"p1": 12, "p2": 12, "roi": 4}
+
 
 def _cameras(file: CameraFile) -> Sequence[Keys]:
     """Return the keys of each camera, with those without a mark; an empty list if a camera has no matrix."""
@@ -26,11 +36,17 @@ def _cameras(file: CameraFile) -> Sequence[Keys]:
     for marks in MARKS:
         sides = [_strip_mark(data, mark) for mark in marks]
         matrices = [[key for key, name in side.items() if re.fullmatch(MATRIX, name)] for side in sides]
-        if all(any(len(flat(data[key])) == 9 for key in keys) for keys in matrices):
+        if all(any(len(flat(data[key])) in (9, 16) for key in keys) for keys in matrices):
             unmarked = {key: fold(key) for key in data if not any(key in side for side in sides)}
-            names_by_key = [{**unmarked, **side} for side in sides]
-            return [Keys(file, {key: data[key] for key in names}, names, data.lines) for names in names_by_key]
+            unmarked = {key: name for key, name in unmarked.items() if name not in SHARED}
+            return [_camera(file, data, {**unmarked, **side}) for side in sides]
     return ()
+
+
+def _camera(file: CameraFile, data: Entries, names: dict[str, str]) -> Keys:
+    """Return the keys of a camera with folded names, without results of stereoRectify."""
+    names = {key: name for key, name in names.items() if RECTIFICATION.get(name) != len(flat(data[key]))}
+    return Keys(file, {key: data[key] for key in names}, names, data.lines)
 
 
 def _pose(keys: Keys) -> StereoPose | None:
@@ -47,6 +63,7 @@ def _flatten_sections(data: Entries) -> Entries:
     lines: dict[str, int] = {}
     for key, value in data.items():
         if isinstance(value, Entries) and "data" not in value:
+            key = match[1] if (match := SECTION.fullmatch(str(key))) else key
             flattened |= {f"{key}_{name}": inner for name, inner in value.items()}
             lines |= {f"{key}_{name}": line for name, line in value.lines.items()}
         else:

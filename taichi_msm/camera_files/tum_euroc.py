@@ -10,14 +10,15 @@ from taichi_msm.camera_files.camera_file import LENGTH_UNITS, CameraFile, listed
 from taichi_msm.camera_files.trajectory import COLUMNS, MAX_NUMBER, Trajectory, TrajectoryReader, parse_numbers
 from taichi_msm.errors import truncate
 
-# Lower-case spellings of the names of columns, and of their units.
-_POSITION = r"(t|p|pos|(.*[^a-z])?position|trans|translation|[tp][^a-z].*[^a-z])?"
-_ROTATION = r"(q|quat|quaternion|(.*[^a-z])?orientation|rot|rotation|q[^a-z].*)"
-ROLES = (
-    r"t|ts|secs?|seconds|(.*[^a-z])?time([^a-z].*)?|.*(timestamp|stamp)([^a-z].*)?",
-    *(rf"{_POSITION}[^a-z]*{axis}" for axis in "xyz"),
-    *(rf"{_ROTATION}[^a-z]*{axis}" for axis in "xyzw"),
-)
+# Lower-case words of the names of columns, of position and rotation those before the axis.
+TIME = {"t", "ts", "sec", "secs", "seconds"}
+POSITION = {"t", "p", "pos", "position", "trans", "translation"}
+ROTATION = {"q", "quat", "quaternion", "rot", "rotation", "orientation"}
+AXES = {*"wxyz"}
+
+# Longer lines are not headers, and longer words not names of columns.
+MAX_HEADER_LENGTH, MAX_NAME_LENGTH = 2000, 80
+
 UNIT = re.compile(r"\s*[\[(]([^\])]*)[\])]|[^a-z](m?u?n?s|nsecs?|mm?)$")
 TIME_UNITS = {
     **dict.fromkeys(("s", "sec", "seconds"), "s"),
@@ -50,8 +51,8 @@ def _read(file: CameraFile) -> Trajectory:
     rows: list[list[float]] = []
     lines = []
     columns = None
-    for n, line in enumerate(file.text.splitlines(), 1):
-        text, _, comment = line.strip().replace('"', "").partition("#")
+    for n, line in file.lines:
+        text, _, comment = line.replace('"', "").partition("#")
         if ";" in text:  # Spreadsheets with decimal commas separate columns by semicolons.
             text = text.replace(",", ".").replace(";", ",")
         words = text.replace(",", " ").split()
@@ -71,24 +72,46 @@ def _read(file: CameraFile) -> Trajectory:
 
 def _header(text: str, *, is_comment: bool) -> list[str]:
     """Split a header into the names of columns; return an empty list for other lines."""
-    text = text.rpartition(":")[2].lower()
+    if len(text) > MAX_HEADER_LENGTH or re.match(r"\s*[-+.]?\d", text := text.rpartition(":")[2].lower()):
+        return []
     names = [name.strip() for name in text.split(",")] if "," in text else re.sub(r"\s+(?=[\[(])", "", text).split()
-    if len(text) > 2000 or max(map(len, names), default=0) > 80:
+    if any(len(name) > MAX_NAME_LENGTH or re.match(r"[-+.]?\d", name) for name in names):
         return []
     bare = [UNIT.sub("", name) for name in names]
-    rotations = sum(bool(re.fullmatch(rf"(.*[^a-z])?{_ROTATION}[^a-z]*[wxyz]", name)) for name in bare)
+    rotations = [
+        words for *words, axis in map(_words, bare) if axis in AXES and ROTATION & {*words[-1:]} | {"q"} & {*words}
+    ]
     is_table = len(names) >= 7 and ("," in text or not is_comment)
-    is_header = rotations >= 4 or {*"wxyz"} <= {*bare} or is_table
-    return names if is_header and not any(re.match(r"[-+.]?\d", name) for name in names) else []
+    return names if len(rotations) >= 4 or {*bare} >= AXES or is_table else []
+
+
+def _words(name: str) -> list[str]:
+    """Split a name into words, of which the axis is the last, as in q_RS_x, orientation.x or qx."""
+    words: list[str] = re.findall("[a-z]+", name) or [""]
+    last = words[-1]
+    return [*words[:-1], last[:-1], last[-1]] if last[:-1] in POSITION | ROTATION and last[-1] in AXES else words
+
+
+def _column(name: str) -> str:
+    """Return the name in `COLUMNS` of a column; "" for other columns."""
+    *words, axis = _words(name)
+    first, last, only = words[:1], words[-1:], words if len(words) == 1 else []
+    if (not words and axis in TIME) or any(word == "time" or word.endswith("stamp") for word in (*words, axis)):
+        return "t"
+    if axis in AXES - {"w"} and (first in ([], ["t"], ["p"]) or last == ["position"] or {*only} & POSITION):
+        return f"t{axis}"
+    if axis in AXES and (first == ["q"] or last == ["orientation"] or {*only} & ROTATION):
+        return f"q{axis}"
+    return ""
 
 
 def _columns(file: CameraFile, line: int, names: Sequence[str]) -> _Columns:
-    bare = [UNIT.sub("", name) for name in names]
-    matches = [[n for n, name in enumerate(bare) if re.fullmatch(role, name)] for role in ROLES]
-    if any(len(columns) != 1 for columns in matches):
+    columns = [_column(UNIT.sub("", name)) for name in names]
+    matches = [[n for n, found in enumerate(columns) if found == column] for column in COLUMNS]
+    if any(len(match) != 1 for match in matches):
         fault = f"unknown or repeated columns in {listed(names)}"
         raise file.fault(f"{fault}; name them {', '.join(COLUMNS)}", line)
-    indices = tuple(columns[0] for columns in matches)
+    indices = tuple(match[0] for match in matches)
     time, *lengths = [(match[1] or match[2] or "") if (match := UNIT.search(names[n])) else "" for n in indices[:4]]
     units = {*lengths} - {""}
     if time not in {"", *TIME_UNITS} or len(units) > 1 or not units <= LENGTH_UNITS.keys():

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from taichi_msm.cli import common, options
-from taichi_msm.errors import FilesError, NotInstalledError, printable
+from taichi_msm.errors import FilesError, NotInstalledError, printable, truncate
 from taichi_msm.runs.directory import require_no_link
 from taichi_msm.system.process import Interruption, write_stderr
 
@@ -131,7 +131,8 @@ def view(
     if seconds is not None and math.isnan(seconds):
         raise click.BadParameter("nan is not a number of seconds", param_hint="--seconds")
     film = None if record is None else _film_path(record)
-    permitted = [_require_origin(origin) for origin in origins]
+    for origin in origins:
+        _require_origin(origin)
     loaded = load_scene(scene, overrides, image)
     directory = common.result_directory(out, f"{Path(scene).stem}-live")
 
@@ -157,7 +158,7 @@ def view(
             common.prefix_errors(scene),
         ):
             if film is None or seconds is None:
-                _serve(begin, scene, port, permitted, film, interruption)
+                _serve(begin, scene, port, origins, film, interruption)
                 return common.DONE
             with begin() as live, common.show_progress(interruption, quiet=False) as progress:
                 events = schedule_events(loaded_script, live.frame_rate, loaded.render.size) if loaded_script else ()
@@ -185,23 +186,20 @@ def _film_path(record: str) -> Path:
     return path
 
 
-def _require_origin(url: str) -> str:
-    """Return the origin of a URL, in the spelling of browsers."""
-    from urllib.parse import urlsplit
+def _require_origin(text: str) -> None:
+    """Raise a BadParameter unless a text is an origin."""
+    from taichi_msm.view.origin import parse_origin
 
-    origin = url.rstrip("/").lower()
-    parts = urlsplit(origin)
-    if parts.scheme not in ("http", "https") or not parts.hostname or f"{parts.scheme}://{parts.netloc}" != origin:
-        message = f"{url} is not an origin; give the scheme, host and port of the page, as https://hub.example.org"
-        raise click.BadParameter(message, param_hint="--origin")
-    return origin
+    if parse_origin(text) is None:
+        expected = "give only the scheme, host and port of the page, as https://hub.example.org"
+        raise click.BadParameter(f"{truncate(text)} is not an origin; {expected}", param_hint="--origin")
 
 
 def _serve(
     begin: Callable[[], Session],
     title: str,
     port: int,
-    origins: list[str],
+    origins: tuple[str, ...],
     film: Path | None,
     interruption: Interruption,
 ) -> None:
@@ -211,7 +209,7 @@ def _serve(
     from taichi_msm.view.server import Server, listen
 
     with listen(port) as listener, begin() as live:
-        server = Server(live, listener, title, origins)
+        server = Server(live, listener, title, origins, lambda line: write_stderr([line]))
         if film is not None:
             live.start_film(film)
         click.echo(server.url)

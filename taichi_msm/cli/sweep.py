@@ -94,8 +94,7 @@ def sweep(
 
 def _print_dry_run(loaded: Sweep, cost: SweepCost, shard: tuple[int, int], workers: int | None, as_json: bool) -> None:
     """Print the values and the cost of the runs of a shard, as a table or as JSON."""
-    from taichi_msm.sweeps.spec import format_override
-    from taichi_msm.sweeps.tables import choose_worker_count, cost_line, csv_line
+    from taichi_msm.sweeps.tables import choose_worker_count, cost_line, csv_line, format_cell
 
     (part, parts), values = shard, loaded.values()
     runs = range(part - 1, len(values), parts)
@@ -107,7 +106,7 @@ def _print_dry_run(loaded: Sweep, cost: SweepCost, shard: tuple[int, int], worke
         return
     click.echo(csv_line(["run", *loaded.keys]))
     for run in runs:
-        click.echo(printable(csv_line([run, *map(format_override, values[run])])))
+        click.echo(printable(csv_line([run, *map(format_cell, values[run])])))
     click.echo(cost_line(len(runs), cost, worker_count))
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import csv
 import io
 import json
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
 from functools import partial
@@ -23,6 +23,7 @@ from taichi_msm.errors import (
     SceneError,
     did_you_mean,
     require_path,
+    require_type,
     writing,
 )
 from taichi_msm.exports.formats import ANY_CAMERA, FORMATS, ExportSource, FormatWriter, read_runs
@@ -35,7 +36,7 @@ from taichi_msm.runs.directory import (
     write_new_file,
 )
 from taichi_msm.runs.finished import RESTORE_PICTURE, FinishedRun
-from taichi_msm.scene.outputs import OUTPUTS, zero_padded
+from taichi_msm.scene.outputs import OUTPUTS, is_formula, zero_padded
 
 EXPORT_RECORD = "export.json"
 
@@ -91,6 +92,7 @@ def export(
     directories = list(runs) if isinstance(runs, Sequence) and not isinstance(runs, str) else [runs]
     for path in [*directories, *([] if out is None else [out])]:
         require_path(path)
+    require_type(progress, Callable, "progress", "a function")
     if not directories:
         raise ArgumentError("runs: []; take the folder of a run or of a sweep, or several")
     if format not in list(FORMATS):
@@ -196,14 +198,16 @@ def _name_run_in_errors(run: FinishedRun, name: str) -> Iterator[None]:
         raise FilesError(f"{run.directory}: its numbers are too large for {name}; run the scene again") from None
 
 
-def _name_runs(note: str, runs: Sequence[Path]) -> str:
-    return f"{runs[0]}{f' and {len(runs) - 1} more' if len(runs) > 1 else ''}: {note}"
+def _name_runs(note: str, directories: Sequence[Path]) -> str:
+    more = f" and {len(directories) - 1} more" if len(directories) > 1 else ""
+    return f"{directories[0]}{more}: {note}"
 
 
 def _write_index(runs: Sequence[FinishedRun], pairs: bool, path: Path) -> None:
     rows: list[tuple[str | int, ...]] = []
     for run in runs:
         name = run.directory.as_posix()
+        name = f"./{name}" if is_formula(name) else name
         rows += [(name, frame) for frame in range(run.frames - 1)] if pairs else [(name,)]
     with io.TextIOWrapper(create_file(path), "utf-8", "surrogateescape", newline="") as file:
         writer = csv.writer(file, lineterminator="\n")

@@ -22,7 +22,7 @@ from taichi_msm.fitting.checks import faults, faults_at_start, opposed, unit_fau
 from taichi_msm.fitting.forces import read_forces
 from taichi_msm.fitting.least_squares import Misfit, Search, Solution
 from taichi_msm.fitting.machine_curve import CurveRuns, has_curve, search_by_curve
-from taichi_msm.fitting.machine_fit import explanations, fitted_tests, unknown_notes
+from taichi_msm.fitting.machine_fit import FittedTest, contact_notes, explanations, fitted_tests, unknown_notes
 from taichi_msm.fitting.machine_model import TABLE_OPTIONS, MachineProblem, read_machine_problem, table_paths
 from taichi_msm.fitting.observation import Array, ErrorCorrelation, Observation
 from taichi_msm.fitting.parameters import Bounds, Method, Parameter, as_data, make_parameters, require_types, rounded
@@ -191,7 +191,8 @@ def _fit(runs: Runs, scene: Scene, method: Method) -> FitResult:
     both = initial, solution.predicted
     if messages := [*opposed(observations, scene, *both), *unit_faults(observations, *both)]:
         raise SceneError(messages)
-    uncertainties = uncertainty(misfit, solution, search.jacobian(solution), error_correlation)
+    derivatives = search.jacobian(solution)
+    uncertainties = uncertainty(misfit, solution, derivatives, error_correlation)
     if isinstance(runs, CurveRuns):
         runs.by_tangent = False  # Profiles are those of curves.
     profiles = Profiler(runs, misfit, solution, uncertainties).profiles() if method.get("profile") else None
@@ -204,15 +205,21 @@ def _fit(runs: Runs, scene: Scene, method: Method) -> FitResult:
     measures_forces = any(observed.noun == "forces" for observed in observations)
     unidentified = unidentified_groups(parameters, solution.x, uncertainties, forces=measures_forces)
     rejection_reason = _rejection(misfit, solution, uncertainties, error_correlation)
-    tests = fitted_tests(machine, values, solution.predicted.values[0]) if machine else ()
-    residuals = misfit.split(misfit.difference(solution.predicted))
+    tests: tuple[FittedTest, ...] = ()
+    if machine:
+        tests = fitted_tests(machine, values, solution.predicted.values[0], derivatives, uncertainties)
+        measured = np.concatenate([fitted.loading.force for fitted in tests])
+        observations = (replace(observations[0], values=measured[:, None]),)
     summaries: dict[str, Any] = {}
-    for observed, part, sigma in zip(observations, residuals, uncertainties.scales, strict=True):
-        summaries |= observed.summary(part, sigma)
+    for observed, predicted, sigma in zip(observations, solution.predicted.values, uncertainties.scales, strict=True):
+        summaries |= observed.summary((predicted - observed.values)[observed.known], sigma)
     has_sigma = all(observed.sigma is not None for observed in observations)
     notes = [*unit_faults(observations, initial), *(note for fitted in tests for note in fitted.loading.test.notes)]
     notes += search_notes(solution, parameters, fits_well=search.fits_well(solution))
     notes += uncertainty_notes(parameters, solution.x, uncertainties, shifts, unidentified)
+    if isinstance(runs, CurveRuns):
+        slopes = misfit.scaled(runs.contact_slopes(solution.x), uncertainties.scales)
+        notes += contact_notes(parameters, solution.x, uncertainties, slopes)
     notes += unknown_notes(tests, {key: values[key] for key, each in estimates.items() if not each.identifiable})
     if rejection_reason:
         notes += explanations(tests, fits_contact=any(key.startswith("contact") for key in values))

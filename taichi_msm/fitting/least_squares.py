@@ -8,7 +8,7 @@ alternately with the parameters.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -73,15 +73,23 @@ class Misfit:
         """Split rows, shape (known, ...), by observation."""
         return np.split(rows, np.cumsum(self.count)[:-1])
 
-    def scaled(self, rows: Array, scales: Scales) -> Array:
-        """Return rows divided by standard deviations, shape (known, ...).
+    @property
+    def freedom(self) -> int:
+        """Number of independent values, less that of offsets."""
+        return sum(observed.freedom for observed in self.observations)
+
+    def scaled(self, rows: Array, scales: Scales, robust_factor: Callable[[Array], Array] | None = None) -> Array:
+        """Return rows divided by standard deviations, without unknown offsets, shape (known, ...).
 
         Args:
             rows: rows in the units of the observations, shape (known, ...).
             scales: standard deviations of the observations.
+            robust_factor: as for `Observation.without_offset`.
         """
         deviations = np.concatenate([np.broadcast_to(scale, n) for scale, n in zip(scales, self.count, strict=True)])
-        return rows / deviations.reshape(-1, *(1,) * (rows.ndim - 1))
+        parts = self.split(rows / deviations.reshape(-1, *(1,) * (rows.ndim - 1)))
+        pairs = zip(self.observations, parts, strict=True)
+        return np.concatenate([observed.without_offset(part, robust_factor) for observed, part in pairs])
 
     def residuals(self, predicted: Prediction, scales: Scales) -> Array:
         """Return the residuals r, shape (known,).
@@ -90,7 +98,7 @@ class Misfit:
             predicted: prediction of all observations.
             scales: standard deviations of the observations.
         """
-        return self.scaled(self.difference(predicted), scales)
+        return self.scaled(self.difference(predicted), scales, self.robust_factor if self.robust else None)
 
     def robust_factor(self, residuals: Array) -> Array:
         """Return d(r), 1 unless robust; the derivatives of rho / 2 by r are r d^(-1/2) and d^(-3/2)."""

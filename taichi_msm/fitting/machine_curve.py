@@ -36,6 +36,9 @@ from taichi_msm.scene.scene import Scene
 # Number of travels of a curve above 0; extension of the curve for free depths of contact [share of its reach].
 TRAVELS, CONTACT_MARGIN = 24, 0.05
 
+# Smallest half width of the trust region, in units of x.
+MIN_REGION = 1e-6
+
 # Share of every branch in the run of a curve: no relaxation, but the compiled kernels of the tests.
 NO_SHARE = 1e-12
 
@@ -160,17 +163,21 @@ class CurveRuns(Runs):
             self._correction = self._correction + predicted.values[0] - by_tangent.values[0]
 
     def with_valid_shares(self, x: Array) -> Array:
-        """Return x, with the free shares scaled down if all shares sum to more than `MAX_SHARES`."""
-        values = self._model.values(x)
-        branches = self._branches(values)
-        free = [key for n in range(len(branches)) if (key := f"tissue.relaxation.{n}.share") in values]
-        total = sum(share for share, _ in branches)
-        if total <= MAX_SHARES or not free:
-            return x
-        free_total = sum(values[key] for key in free)
-        # The sum of 0.98 leaves a margin for finite differences.
-        reduction = np.log(max(0.98 - (total - free_total), NO_SHARE) / free_total)
-        return x + reduction * np.array([parameter.key in free for parameter in self.problem.parameters])
+        """Return x, with the free shares scaled down, within bounds, if all shares sum to more than `MAX_SHARES`."""
+        keys, low = [parameter.key for parameter in self.problem.parameters], self.problem.limits[0]
+        while True:
+            values = self._model.values(x)
+            branches = self._branches(values)
+            names = [f"tissue.relaxation.{n}.share" for n in range(len(branches))]
+            is_scaled = np.array([key in names for key in keys]) & (x > low)
+            total = sum(share for share, _ in branches)
+            scaled = sum(value for value, changes in zip(values.values(), is_scaled, strict=True) if changes)
+            if total <= MAX_SHARES:
+                return x
+            # A sum of 0.98 leaves a margin for finite differences. Shares at their bounds leave the next pass.
+            if (rest := 0.98 - (total - scaled)) <= 0:
+                return np.where(is_scaled, low, x)
+            x = np.maximum(x + np.log(rest / scaled) * is_scaled, low)
 
     def set_tangent(self, x: Array) -> None:
         """Linearise the curve at x; raise the errors of `ForwardModel.predict`."""
@@ -194,11 +201,29 @@ class CurveRuns(Runs):
             region: half width in every coordinate, shape (n,).
         """
         low, high = self.problem.limits
+        region = np.maximum(
+            region, MIN_REGION
+        )  # A parameter without effect does not move, which shrinks its region to 0.
         margin = np.array(
             [CONTACT_MARGIN * self._tangent.reach / (parameter.scale or 1) for parameter in self.problem.parameters]
         )
         below = np.where(self._is_contact, np.minimum(region, margin), region)
         return np.maximum(low, x - below), np.minimum(high, x + region)
+
+    def contact_slopes(self, x: Array) -> Array:
+        """Return the derivatives of the forces by the estimated depths of contact, shape (frames of all tests, m).
+
+        Depths of contact that are given, or parameters, have no column.
+        """
+        values = self._model.values(x)
+        reach = self._reach(values)
+        forces, step = self._forces(values, reach), 1e-3 * reach
+        columns = []
+        for loading, key in zip(self.problem.tests, self.problem.contact_keys, strict=True):
+            if loading.finds_contact and key not in values:
+                moved = [self._predict(values | {key: loading.contact + end}, reach, forces) for end in (step, -step)]
+                columns.append((moved[0].values[0] - moved[1].values[0]) / (2 * step))
+        return np.hstack([np.empty((sum(len(loading.force) for loading in self.problem.tests), 0)), *columns])
 
     def _reach(self, values: dict[str, float]) -> float:
         """Return the greatest travel of a curve [m]; raise a SceneError if it is 0 in all tests."""

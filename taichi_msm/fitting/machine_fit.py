@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -10,11 +11,15 @@ import numpy as np
 
 from taichi_msm.fitting.machine_model import MachineProblem
 from taichi_msm.fitting.observation import Array
-from taichi_msm.fitting.parameters import rounded
+from taichi_msm.fitting.parameters import Parameter, rounded
+from taichi_msm.fitting.uncertainty import Uncertainty
 from taichi_msm.machines.loading import CONTACT_NOISES, Loading
 
 # Largest change of the depth while the tool is held, as a share of the travel.
 HELD_SHARE = 0.02
+
+# Largest error of a parameter with an estimated contact that is not reported, in half widths of its interval.
+MAX_CONTACT_EFFECT = 1.5
 
 
 @dataclass(frozen=True, eq=False)
@@ -22,14 +27,16 @@ class FittedTest:
     """Machine test with the forces of the fitted scene.
 
     Attributes:
-        loading: the test, sampled at frames.
+        loading: the test, sampled at frames, without the fitted offset.
         contact: depth of contact, fitted or given, as in the table [m].
         force: fitted force at every frame [N], shape (frames,).
+        offset_error: standard error of the offset [N].
     """
 
     loading: Loading
     contact: float
     force: Array
+    offset_error: float = 0.0
 
     @property
     def residual(self) -> float:
@@ -50,25 +57,65 @@ class FittedTest:
             "name": loading.test.name,
             "contact": self.contact,
             "noise": loading.noise,
+            "sigma": float(loading.sigma.mean()),
+            "offset": {"value": loading.offset, "standard_error": self.offset_error},
             "peak": loading.peak,
             "residual_force": self.residual,
             "frames": len(loading.force),
         }
 
 
-def fitted_tests(problem: MachineProblem, values: Mapping[str, float], forces: Array) -> tuple[FittedTest, ...]:
-    """Return the fitted tests.
+def fitted_tests(
+    problem: MachineProblem, values: Mapping[str, float], forces: Array, slopes: Array, uncertainties: Uncertainty
+) -> tuple[FittedTest, ...]:
+    """Return the fitted tests, without their offsets, the weighted means of measured minus fitted forces.
 
     Args:
         problem: the fit.
         values: fitted values of the parameters by key.
         forces: fitted forces of all tests [N], shape (frames of all tests, 1).
+        slopes: their derivatives by x [N], shape (frames of all tests, n).
+        uncertainties: uncertainty of the solution.
     """
-    ends = np.cumsum([len(loading.force) for loading in problem.tests])[:-1]
-    return tuple(
-        FittedTest(loading, values.get(key, loading.contact), force)
-        for loading, key, force in zip(problem.tests, problem.contact_keys, np.split(forces[:, 0], ends), strict=True)
-    )
+    tests, start = [], 0
+    for loading, key in zip(problem.tests, problem.contact_keys, strict=True):
+        frames = slice(start, start := start + len(loading.force))
+        force, weights = forces[frames, 0], (loading.information > 0) / loading.sigma**2
+        # Residuals r of informative frames lack the offset.
+        frame = int(np.argmax(loading.information > 0))
+        residual = loading.sigma[frame] * uncertainties.residuals[frames][frame]
+        offset = float(residual - (force - loading.force)[frame])
+        mean_slopes = weights @ slopes[frames] / weights.sum()
+        error = math.hypot(
+            math.sqrt(uncertainties.factor / weights.sum()), float(np.linalg.norm(mean_slopes @ uncertainties.root))
+        )
+        tests.append(FittedTest(loading.without_offset(offset), values.get(key, loading.contact), force, error))
+    return tuple(tests)
+
+
+def contact_notes(
+    parameters: Sequence[Parameter], x: Array, uncertainties: Uncertainty, slopes: Array
+) -> Iterator[str]:
+    """Yield a warning about estimated depths of contact whose errors exceed the intervals of parameters.
+
+    Args:
+        parameters: parameters of the fit.
+        x: their coordinates at the solution, shape (n,).
+        uncertainties: uncertainty of the solution.
+        slopes: derivatives of the residuals r by the estimated depths of contact [1/m], shape (known, contacts).
+    """
+    # Step to the minimum with free depths of contact, and its standard deviations.
+    inverse = np.linalg.pinv(np.column_stack([uncertainties.weighted, slopes]))
+    errors = np.abs(inverse @ uncertainties.residuals)
+    errors += uncertainties.quantile * np.sqrt(uncertainties.factor) * np.linalg.norm(inverse, axis=1)
+    contact, count = rounded(1000 * float(errors[len(x) :].max(initial=0.0))), len(x)
+    half_widths = uncertainties.quantile * uncertainties.deviations
+    moved = np.flatnonzero((errors[:count] > MAX_CONTACT_EFFECT * half_widths) & ~uncertainties.unidentified).tolist()
+    if moved and slopes.shape[1]:
+        shares = [(parameters[n].key, parameters[n].relative_error(x[n], float(errors[n]))) for n in moved]
+        known = " and ".join(f"{key} to {rounded(100 * share)} %" for key, share in shares)
+        fault = f"the depth of contact, found from the noise, is known to {contact} mm, and {known}"
+        yield f"{fault}, beyond the interval; take --free contact, or give an exact depth by --contact"
 
 
 def unknown_notes(tests: Sequence[FittedTest], values: Mapping[str, float]) -> Iterator[str]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import secrets
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, ClassVar
@@ -35,15 +35,48 @@ TABLE_SUFFIXES = (".csv", ".tsv", ".txt", ".xlsx")
 TABLE_OPTIONS = ("columns", "sheet", "block", "window", "rate", "contact")
 POINT_OPTIONS = ("sigma", "correlation", "drift", "resolution")
 
+# Number of reweighted means for the offset of a robust fit.
+ROBUST_STEPS = 20
+
 
 @dataclass(frozen=True, eq=False)
 class MachineForces(Forces, ObservationModel):
     """Forces along the tool's direction [N] of all tests; values of shape (frames of all tests, 1).
 
-    The observation is its own model: the map from the run of a test to these forces.
+    The observation is its own model: the map from the run of a test to these forces. The force of every test has an
+    unknown offset.
+
+    Attributes:
+        approach: straight path of the tool.
+        tests: the tests, sampled at frames.
     """
 
+    is_independent: ClassVar[bool] = False  # Their chi-square is the total.
+
     approach: Approach
+    tests: tuple[Loading, ...]
+
+    @property
+    def freedom(self) -> int:
+        return round(sum(float(loading.information.sum()) for loading in self.tests)) - len(self.tests)
+
+    @property
+    def sigma_freedom(self) -> float:
+        return sum(loading.sigma_freedom for loading in self.tests)
+
+    def without_offset(self, rows: Array, robust_factor: Callable[[Array], Array] | None = None) -> Array:
+        # Offsets are weighted means; frames without information do not count.
+        ends, parts = np.cumsum([len(loading.force) for loading in self.tests])[:-1], []
+        for part, loading in zip(np.split(rows, ends), self.tests, strict=True):
+            unit = (loading.information > 0) / loading.sigma
+            part = (part.T * (unit > 0)).T
+            centred = part - np.multiply.outer(unit, unit @ part / (unit @ unit))
+            if robust_factor is not None:
+                for _ in range(ROBUST_STEPS):
+                    weights = unit / np.sqrt(robust_factor(centred))
+                    centred = part - unit * (weights @ part / (weights @ unit))
+            parts.append(centred)
+        return np.concatenate(parts)
 
     def build_model(self, scene: Scene, frames: int) -> MachineForces:
         return self
@@ -210,18 +243,20 @@ def read_machine_problem(
             loading = replace(loading, test=replace(loading.test, notes=(*loading.test.notes, note)))
         tests.append(loading)
     parameters = _make_parameters(scene, tests, free, bounds, approach.probe)
-    first, lengths = tests[0], [len(loading.force) for loading in tests]
+    first = tests[0]
     placed = approach.place(as_data(without_outputs(scene)), first.travel(), first.rate)
     observations = MachineForces(
         ", ".join(loading.test.name for loading in tests),
         np.concatenate([np.arange(len(loading.force)) / loading.rate for loading in tests]),
         np.concatenate([loading.force for loading in tests])[:, None],
-        np.repeat([loading.sigma for loading in tests], lengths),
+        np.concatenate([loading.sigma for loading in tests]),
         approach,
+        tuple(tests),
     )
-    if sum(lengths) <= len(parameters):
-        fault = f"{sum(lengths)} frames, too few for {len(parameters)} parameters; raise --rate"
-        raise SceneError([f"{observations.name}: {fault}"])
+    if observations.freedom <= len(parameters):
+        count = sum(int(np.count_nonzero(loading.information)) for loading in tests)
+        fault = f"frames with rows: {count}, too few for {len(parameters)} parameters and the offset of the force"
+        raise SceneError([f"{observations.name}: {fault}; raise --rate"])
     return MachineProblem(secrets.token_hex(8), Scene(**placed), parameters, (observations,), tuple(tests), approach)
 
 
@@ -244,7 +279,8 @@ def _make_parameters(
     for key, test in zip(contacts, tests, strict=True):
         if key in free:
             # Depths of contact are in metres, as in the table; x is in units of their range.
-            first, last = float(test.depth[0]), float(test.depth.max())
+            # The depth of the row of contact may be below that of the first row, by noise.
+            first, last = min(float(test.depth[0]), test.contact), float(test.depth.max())
             low, high = bounds.get(key, (first, last))
             low, high = max(first, low), min(last, high)
             if not (low <= test.contact <= high and low < high):

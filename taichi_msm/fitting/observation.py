@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import math
 from abc import ABC, abstractmethod
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, ClassVar, NamedTuple
 
@@ -75,6 +76,25 @@ class Observation(ABC):
     def known(self) -> NDArray[np.bool_]:
         """Mask of the measured values, with their shape."""
         return np.isfinite(self.values)
+
+    @property
+    def freedom(self) -> int:
+        """Number of independent values, less that of offsets."""
+        return int(self.known.sum())
+
+    @property
+    def sigma_freedom(self) -> float:
+        """Degrees of freedom of a sigma that is itself an estimate; infinite for an exact one."""
+        return math.inf
+
+    def without_offset(self, rows: Array, robust_factor: Callable[[Array], Array] | None = None) -> Array:
+        """Return rows [sigma], shape (known, ...), less the offset of their errors that minimises their squares.
+
+        Args:
+            rows: residuals, or their derivatives.
+            robust_factor: d(r) of the cost of residuals, as of `Misfit`, to minimise that.
+        """
+        return rows
 
     def with_sigma(self, sigma: Any) -> Self:
         """Return the observation with a new sigma, or unchanged for None; raise a SceneError for an invalid sigma."""

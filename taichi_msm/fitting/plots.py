@@ -186,9 +186,10 @@ def _plot_test_over_depth(axes: Axes, fitted: FittedTest) -> None:
 
 
 def _plot_test_residual(axes: Axes, fitted: FittedTest) -> None:
-    """Plot fitted minus measured force of a machine test over time, with twice the noise on either side."""
+    """Plot fitted minus measured force of a machine test over time, with two standard deviations on either side."""
     loading, residual = fitted.loading, fitted.force - fitted.loading.force
-    axes.axhspan(-2 * loading.noise, 2 * loading.noise, color=SILVER, alpha=0.4, linewidth=0, label="2 x noise")
+    band = 2 * loading.sigma
+    axes.fill_between(loading.time, -band, band, color=SILVER, alpha=0.4, linewidth=0, label="2 sigma")
     axes.plot(loading.time, residual, color=BLUE, linewidth=0.8)
     limit = 1.1 * float(np.abs(residual).max())
     axes.set(xlabel="time [s]", ylabel="fitted minus measured [N]", ylim=(-limit, limit))

@@ -194,7 +194,8 @@ class FitResult:
             residual = (
                 f"{fitted.residual:.3g} N, {rounded(100 * fitted.residual / peak)} % of the peak, at {frames} frames"
             )
-            details = f"noise {fitted.loading.noise:.2g} N, contact at {fitted.contact:.4g} m"
+            offset = f"offset {fitted.loading.offset:.3g} +- {rounded(fitted.offset_error)} N"
+            details = f"noise {fitted.loading.noise:.2g} N, {offset}, contact at {fitted.contact:.4g} m"
             lines.append(f"{fitted.loading.test.name}: residual {residual}; {details}{chi_text}")
         force_text = "" if self.residual_force is None else f", {self.residual_force:.3g} N"
         for observed in self.observations:

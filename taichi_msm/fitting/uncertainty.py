@@ -121,7 +121,7 @@ def uncertainty(
         error_correlation: correlation of the errors, which defines K.
     """
     parameters = len(solution.x)
-    freedom = max(1, sum(misfit.count) - parameters)
+    freedom = max(1, misfit.freedom - parameters)
     scales = misfit.scales(misfit.deviations(solution.predicted, parameters))
     residuals, jacobian = misfit.residuals(solution.predicted, scales), misfit.scaled(derivatives, scales)
     robust_factor = misfit.robust_factor(residuals)
@@ -133,7 +133,9 @@ def uncertainty(
     singular_values = np.where(is_unidentified, 1 / 1e4, singular.S)
     directions = np.where(is_unidentified & (np.abs(singular.Vh.T) < MIN_COMPONENT), 0.0, singular.Vh.T)
     independent_root = root = np.sqrt(factor) * directions / singular_values
-    independent = float(freedom)
+    sigma_freedom = min(observed.sigma_freedom for observed in misfit.observations)
+    # The estimate of sigma adds 2 / sigma_freedom to the relative variance 2 / freedom of chi-square.
+    independent = 1 / (1 / freedom + 1 / sigma_freedom)
     if error_correlation != (None, None):
         # U^T K U, and the effective number of observations tr(K)^2 / tr(K^2).
         pairs = zip(misfit.observations, misfit.split(singular.U), strict=True)

@@ -62,17 +62,19 @@ SPRING_PARTS, FOUNDATION_PART, SUM_PARTS = 0, 3, 4
 # KEEP_SUM              q . u, for the derivative with respect to keep
 # TENSION_SUMS          derivatives with respect to tau of each family of springs, 3 sums
 # BENDING_SUM           derivative with respect to log D
-# LOCK_SUMS             derivatives with respect to log(lock) and factor of the springs
-# FOUNDATION_LOCK_SUMS  the same for the foundation
+# LAW_SUMS              derivatives with respect to log m and the shape of the law of springs, LAW_NUMBERS sums at most
+# FOUNDATION_LAW_SUMS   the same for the foundation
 # ROW_SUMS              number of sums
-KEEP_SUM, TENSION_SUMS, BENDING_SUM, LOCK_SUMS, FOUNDATION_LOCK_SUMS, ROW_SUMS = 0, 1, 4, 5, 7, 9
+LAW_NUMBERS = 4
+KEEP_SUM, TENSION_SUMS, BENDING_SUM, LAW_SUMS = 0, 1, 4, 5
+FOUNDATION_LAW_SUMS, ROW_SUMS = LAW_SUMS + LAW_NUMBERS, LAW_SUMS + 2 * LAW_NUMBERS
 
 # Indices of the results of `SpringTerm.build_spring_tangent`. After the change of the force, 3, the derivatives with
 # respect to
 # BY_STIFFNESS  k - tau
 # BY_TENSION    tau
-# BY_LOCK       log(lock) and factor, only of springs that lock
-BY_STIFFNESS, BY_TENSION, BY_LOCK = 3, 4, 5
+# BY_LAW        log m and the shape of their law
+BY_STIFFNESS, BY_TENSION, BY_LAW = 3, 4, 5
 
 # Derivatives per slot, step and row: with respect to the force, 3, and the control point, 2.
 LOAD_DERIVATIVES = 5
@@ -177,12 +179,7 @@ def _build_store_moments(code: KernelConfig) -> list[Callable[..., None]]:
 def build_store(code: KernelConfig, *, parallel: bool) -> Callable[..., None]:
     """Build the kernel that steps forward and stores all displacements.
 
-    Args:
-        code: terms and number types of the kernel.
-        parallel: whether the workers run in parallel; otherwise one thread runs the steps of all workers in turn.
-
-    Returns:
-        The kernel `store`.
+    Unless `parallel`, a single thread runs the steps of all workers in turn.
     """
     real, vector, vectors = code.real, code.vector, code.vectors
     count_of_numbers, fill_halo, step = code.first_constant(None), build_fill_halo(code), build_point_step(code)
@@ -230,15 +227,11 @@ def build_store(code: KernelConfig, *, parallel: bool) -> Callable[..., None]:
         d_x: vectors, d_y: vectors, d_z: vectors,
         constants_of: ti.types.ndarray(dtype=vector, ndim=1), by_column: vectors, fields: vectors,
     ):  # fmt: skip
-        """Step forward.
+        """Step forward from the first of the displacements `u` of all steps [m].
 
-        Args:
-            sizes: sizes of the launch, with indices from `COUNT` on, shape (11,).
-            progress: steps finished by each worker, at multiples of `STRIDE`, shape (STRIDE workers,).
-            loads: loads of every step, as in `Dynamics.step_table`, shape (steps, columns).
-            u_x, u_y, u_z: displacements of all steps [m], then the workers' moments and carried forces.
-            d_x, d_y, d_z: last differences of the displacements [m], updated.
-            constants_of, by_column, fields: arrays of the sheet, see `KernelSheet`.
+        After them, `u` has the workers' moments and carried forces. `d` are the last differences [m]. The elements of
+        `sizes` have the indices from `COUNT` on; `progress` is the number of steps that each worker has finished, at
+        multiples of `STRIDE`; `loads` is a `Dynamics.step_table`.
         """
         ti.loop_config(serialize=not parallel)
         for index in range(ti.cast(sizes[WORKERS], ti.i32) * ITERATIONS_PER_THREAD):
@@ -267,9 +260,10 @@ def _build_sweep_row(code: KernelConfig) -> Callable[..., None]:
     slots, stationary = len(probes.moves), probes.moves.count(False)
     foundation = code.first_column(FoundationTerm) if foundation_term else 0
     foundation_derivatives = [foundation_term.build_derivatives(code)] if foundation_term else []
-    stiffness_functions = [foundation_term.build_stiffness(code)] if foundation_term and foundation_term.locks else []
-    locks = springs.law.parameter_count > 0
-    results = BY_LOCK + 2 if locks else BY_LOCK
+    stiffness_functions = [foundation_term.build_stiffness(code)] if foundation_term and foundation_term.law else []
+    law, foundation_law = springs.law, foundation_term.law if foundation_term else None
+    numbers, foundation_numbers = (1 + each.shape_count if each else 0 for each in (law, foundation_law))
+    results = BY_LAW + numbers
 
     @ti.func
     def spring_tangent(sheet: ti.template(), offset, p, q, x0, y0, length, k, family: ti.template()):
@@ -361,14 +355,13 @@ def _build_sweep_row(code: KernelConfig) -> Callable[..., None]:
                         add(sheet.derivatives, index, by_foundation[0] * (0 - now[foundation]))
                         for stiffness_at in ti.static(stiffness_functions):
                             k = stiffness_at(sheet, entry, now[foundation])
-                            for n in ti.static(range(2)):
-                                at_sum = ti.static(FOUNDATION_LOCK_SUMS + n)
+                            for n in ti.static(range(foundation_numbers)):
+                                at_sum = ti.static(FOUNDATION_LAW_SUMS + n)
                                 sums[at_sum] = sums[at_sum] - k * by_foundation[1 + n]
-                    if ti.static(locks):
-                        for n in ti.static(range(2)):
-                            by_lock = ti.static(BY_LOCK + n)
-                            of_springs = (right[by_lock] + down[by_lock]) + (falling[by_lock] + rising[by_lock])
-                            sums[LOCK_SUMS + n] = sums[LOCK_SUMS + n] - of_springs
+                    for n in ti.static(range(numbers)):
+                        by_law = ti.static(BY_LAW + n)
+                        of_springs = (right[by_law] + down[by_law]) + (falling[by_law] + rising[by_law])
+                        sums[LAW_SUMS + n] = sums[LAW_SUMS + n] - of_springs
                     if ti.static(tension):
                         sums[TENSION_SUMS + ALONG_ROW] = sums[TENSION_SUMS + ALONG_ROW] - right[BY_TENSION]
                         sums[TENSION_SUMS + ALONG_COLUMN] = sums[TENSION_SUMS + ALONG_COLUMN] - down[BY_TENSION]
@@ -403,15 +396,7 @@ def _build_sweep_row(code: KernelConfig) -> Callable[..., None]:
 
 @cache
 def build_sweep(code: KernelConfig, *, parallel: bool) -> Callable[..., None]:
-    """Build the kernel that sweeps the adjoint, from the last step to the first.
-
-    Args:
-        code: terms and number types of the kernel.
-        parallel: whether the workers run in parallel; otherwise one thread runs the steps of all workers in turn.
-
-    Returns:
-        The kernel `sweep`.
-    """
+    """Build the kernel that sweeps the adjoint, from the last step to the first; `parallel` as in `build_store`."""
     real, vector, vectors, count_of_numbers = code.real, code.vector, code.vectors, code.first_constant(None)
     fill_halo, storing = build_fill_halo(code), _build_store_moments(code)
     sweep_row = _build_sweep_row(code)
@@ -451,16 +436,11 @@ def build_sweep(code: KernelConfig, *, parallel: bool) -> Callable[..., None]:
         constants_of: ti.types.ndarray(dtype=vector, ndim=1),
         by_column: vectors, fields: vectors, derivatives: vectors,
     ):  # fmt: skip
-        """Sweep backward.
+        """Sweep backward over the displacements `u` of all steps of a segment [m].
 
-        Args:
-            sizes, progress, loads: as in `store`, with the loads of the swept steps.
-            by_load: derivatives with respect to the loads, added up over a row, shape (steps, rows, slots x 5),
-                overwritten.
-            p_x, p_y, p_z: adjoint state, see `BUFFERS`, then the workers' moments and carried forces; updated.
-            u_x, u_y, u_z: displacements of all steps of the segment [m].
-            constants_of, by_column, fields: arrays of the sheet, see `KernelSheet`.
-            derivatives: accumulated derivatives, see `SPRING_PARTS`; updated.
+        `sizes`, `progress` and `loads`, of the swept steps, are as in `store`. `by_load` receives the derivatives with
+        respect to the loads, added up over a row, shape (steps, rows, slots x 5). `p` is the adjoint state, see
+        `BUFFERS`, then the workers' moments and carried forces. For `derivatives`, see `SPRING_PARTS`.
         """
         ti.loop_config(serialize=not parallel)
         for index in range(ti.cast(sizes[WORKERS], ti.i32) * ITERATIONS_PER_THREAD):
@@ -477,7 +457,7 @@ def build_sweep(code: KernelConfig, *, parallel: bool) -> Callable[..., None]:
 
 @cache
 def build_copy(code: KernelConfig) -> Callable[..., None]:
-    """Build the kernel that copies a range of entries from three arrays to three others."""
+    """Build the kernel that copies three arrays."""
     vectors = code.vectors
 
     @ti.kernel
@@ -486,14 +466,7 @@ def build_copy(code: KernelConfig) -> Callable[..., None]:
         from_x: vectors, from_y: vectors, from_z: vectors,
         to_x: vectors, to_y: vectors, to_z: vectors,
     ):  # fmt: skip
-        """Copy three arrays.
-
-        Args:
-            entries: number of entries.
-            source, target: first entry to read, and to write.
-            from_x, from_y, from_z: arrays to read.
-            to_x, to_y, to_z: arrays to write.
-        """
+        """Copy entries of three arrays, from `source` on, to three others, from `target` on."""
         ti.loop_config(serialize=True)
         for n in range(entries):
             for a, b in ti.static(((from_x, to_x), (from_y, to_y), (from_z, to_z))):

@@ -17,13 +17,14 @@ from numpy.typing import NDArray
 
 from taichi_msm.errors import MsmError, Pause
 from taichi_msm.gradients.chain_rule import LoadGradient, SheetGradient
+from taichi_msm.laws.law import LawNumbers
 from taichi_msm.model.loads import Schedule, decay, decay_gradient, evaluate_frame_loads
 from taichi_msm.model.plan import Plan
 from taichi_msm.model.sheet import spacing
 from taichi_msm.solver.rest import QuasiStatics
 from taichi_msm.system.runtime import Device
 from taichi_msm.terms.elasticity import SpringFamily, spring_families
-from taichi_msm.terms.foundation import foundation_derivatives, foundation_force, foundation_tangent, point_shares
+from taichi_msm.terms.foundation import FoundationForce, foundation_force, point_shares
 
 if TYPE_CHECKING:
     from scipy.sparse import csc_matrix
@@ -35,12 +36,7 @@ RESIDUAL_TOLERANCE = 1e-6
 
 
 class RestAdjoint:
-    """Adjoint of a quasi-static sheet.
-
-    Args:
-        plan: plan in f64 with a stiffness map.
-        device: device of the kernels, a CPU.
-    """
+    """Adjoint of a quasi-static sheet on a CPU; its plan is in f64 with a stiffness map."""
 
     def __init__(self, plan: Plan, device: Device) -> None:
         self._forward = QuasiStatics(plan, device)
@@ -55,17 +51,7 @@ class RestAdjoint:
         return self._forward.plan
 
     def run(self, pause: Pause) -> Array:
-        """Solve all frames.
-
-        Args:
-            pause: called several times a second; an exception from it ends the solution.
-
-        Returns:
-            Displacements at every frame [m], shape (F + 1, rows, cols, 3).
-
-        Raises:
-            DivergedError: when a frame has no equilibrium.
-        """
+        """Solve all frames; return the displacements at every frame [m], shape (F + 1, rows, cols, 3)."""
         frames = []
         for n in range(self.plan.grid.frames + 1):
             self._forward.advance(int(n > 0), pause)
@@ -74,24 +60,17 @@ class RestAdjoint:
         return self._displacements.copy()
 
     def backward(self, by_frame: Array, pause: Pause) -> tuple[SheetGradient, LoadGradient]:
-        """Differentiate a loss at the last `run`.
+        """Differentiate a loss at the last `run`; raise an MsmError if the tangent stiffness is singular.
 
-        Args:
-            by_frame: derivative of the loss with respect to the displacements at every frame, shape (F + 1, rows, cols,
-                3).
-            pause: called several times a second; an exception from it ends the differentiation.
-
-        Returns:
-            Derivatives with respect to the coefficients of the sheet, and to its loads.
-
-        Raises:
-            MsmError: when the tangent stiffness is singular.
+        `by_frame` is the derivative of the loss with respect to the displacements at every frame, as `run` returns
+        them.
         """
         plan, (rows, cols) = self.plan, self.plan.scene.sheet.points
         families, laplacian = list(spring_families(plan)), _laplacian(plan)
         gradient = SheetGradient(
             (np.zeros((rows, cols - 1)), np.zeros((rows - 1, cols)), np.zeros((rows - 1, cols - 1))),
-            np.zeros(3), np.zeros((rows, cols)), 0.0, np.zeros(2), np.zeros(2),
+            np.zeros(3), np.zeros((rows, cols)), 0.0, _zeros(plan.material.stiffening),
+            _zeros(plan.material.virtual_stiffening),
         )  # fmt: skip
         loads = LoadGradient(plan)
         for n, by_displacement in enumerate(by_frame):
@@ -101,7 +80,8 @@ class RestAdjoint:
                 continue
             at_frame = evaluate_frame_loads(plan, n)
             foundation = plan.material.virtual * at_frame.active[0] * point_shares(plan)
-            stiffness = _stiffness(plan, families, foundation, laplacian, u)
+            of_foundation = foundation_force(plan.material, foundation, u)
+            stiffness = _stiffness(plan, families, of_foundation, laplacian, u)
             p = _run_interruptibly(partial(_solve, plan, stiffness, by_displacement), pause)
             if p is None:
                 if not u.any():
@@ -111,11 +91,8 @@ class RestAdjoint:
                     "pretension or bending"
                 )
             _add_springs(gradient, families, u, p)
-            gradient.foundation_stiffening += [
-                float((by_number * p[..., 2]).sum())
-                for by_number in foundation_derivatives(plan.material, foundation, u[..., 2])
-            ]
-            gradient.foundation += (foundation_force(plan.material, foundation, u) * p).sum(axis=-1)
+            gradient.foundation_stiffening += [float((by * p[..., 2]).sum()) for by in of_foundation.by_numbers]
+            gradient.foundation += (of_foundation.force * p).sum(axis=-1)
             curvatures = laplacian @ u.reshape(-1, 3), laplacian @ p.reshape(-1, 3)
             gradient.bending -= plan.material.bending * float((curvatures[0] * curvatures[1]).sum())
             self._add_loads(loads, n, at_frame, p)
@@ -134,30 +111,35 @@ class RestAdjoint:
         loads.add(lambda plan: evaluate_frame_loads(plan, frame), by_slot, (time - margin, time + margin))
 
 
+def _zeros(law: LawNumbers | None) -> Array:
+    """Return zeros for the derivatives by log m and the shape of a law."""
+    return np.zeros(law.law.shape_count + 1 if law else 0)
+
+
 def _add_springs(gradient: SheetGradient, families: Sequence[SpringFamily], u: Array, p: Array) -> None:
     """Add the derivatives with respect to the coefficients of the springs, for the adjoint p at displacements u."""
     for n, family in enumerate(families):
         q, edges, square_difference, square = family.elongation(u)
         p_difference = p[family.start] - p[family.end]
         along = (p_difference * edges).sum(axis=-1)
-        _, _, by_stiffness, by_tension = family.derivatives(square_difference, square, along)
+        _, _, by_stiffness, by_tension, by_numbers = family.derivatives(square_difference, square, along)
         index = min(n, 2)  # both diagonals count as one family
         gradient.springs[index][...] += by_stiffness * along
-        gradient.stiffening += [
-            float((by * along).sum()) for by in family.parameter_derivatives(square_difference, square)
-        ]
+        gradient.stiffening += [float((by * along).sum()) for by in by_numbers]
         gradient.tensions[index] += (p_difference * q).sum() + (by_tension * along).sum()
 
 
-def _stiffness(plan: Plan, families: Sequence[SpringFamily], foundation: Array, laplacian: Any, u: Array) -> csc_matrix:
+def _stiffness(
+    plan: Plan, families: Sequence[SpringFamily], foundation: FoundationForce, laplacian: Any, u: Array
+) -> csc_matrix:
     """Assemble the tangent stiffness K [N/m], in the order x, y, z of each mass point."""
     from scipy import sparse
 
     shape = plan.scene.sheet.points
     number, axis = np.arange(plan.fixed.size).reshape(shape), np.arange(3)
-    total = sparse.diags(
-        foundation_tangent(plan.material, foundation, u).ravel()
-    ) + plan.material.bending * sparse.kron(laplacian.T @ laplacian, sparse.identity(3))
+    total = sparse.diags(foundation.tangent.ravel()) + plan.material.bending * sparse.kron(
+        laplacian.T @ laplacian, sparse.identity(3)
+    )
     for family in families:
         blocks = family.tangent(u).reshape(-1, 3, 3)
         p, q = (3 * number[end].reshape(-1, 1, 1) for end in (family.start, family.end))

@@ -15,7 +15,8 @@ from typing import Any, ClassVar
 
 from numpy.polynomial import Polynomial
 
-from taichi_msm.lenses.model import MAX_RADIUS, Coefficient, LensModel, Operations, positive_roots
+from taichi_msm.arithmetic import Operations
+from taichi_msm.lenses.model import MAX_RADIUS, Coefficient, LensModel, positive_roots
 
 # Squared radius below which t / r rounds to 1.
 MIN_SQUARED_RADIUS = 1e-16

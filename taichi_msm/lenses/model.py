@@ -16,6 +16,8 @@ import numpy as np
 from numpy.polynomial import Polynomial
 from numpy.typing import NDArray
 
+from taichi_msm.arithmetic import Operations
+
 Array = NDArray[np.float64]
 
 # Maximum valid radius of any lens: 88 degrees from the optical axis.
@@ -25,18 +27,6 @@ MAX_RADIUS = math.tan(math.radians(88))
 MIN_COEFFICIENT = 1e-100
 
 MAX_COEFFICIENT = 1e6
-
-
-class Operations(NamedTuple):
-    """Functions of NumPy or Taichi that lenses use in addition to + - * /."""
-
-    sqrt: Callable[..., Any]
-    arctan: Callable[..., Any]
-    maximum: Callable[..., Any]
-    wrap: Callable[[Callable[..., Any]], Callable[..., Any]]  # from a Python function to one that the formula can call
-
-
-NUMPY = Operations(np.sqrt, np.arctan, np.maximum, lambda function: function)
 
 
 class Coefficient(NamedTuple):

@@ -15,7 +15,8 @@ import math
 from collections.abc import Callable, Sequence
 from typing import Any, ClassVar
 
-from taichi_msm.lenses.model import MAX_RADIUS, Coefficient, LensModel, Operations
+from taichi_msm.arithmetic import Operations
+from taichi_msm.lenses.model import MAX_RADIUS, Coefficient, LensModel
 from taichi_msm.lenses.rational import Rational
 
 

@@ -17,7 +17,8 @@ from typing import Any, ClassVar
 import numpy as np
 from numpy.polynomial import Polynomial
 
-from taichi_msm.lenses.model import MAX_RADIUS, MIN_COEFFICIENT, Coefficient, LensModel, Operations, positive_roots
+from taichi_msm.arithmetic import Operations
+from taichi_msm.lenses.model import MAX_RADIUS, MIN_COEFFICIENT, Coefficient, LensModel, positive_roots
 
 
 class Rational(LensModel):

@@ -1,19 +1,21 @@
 """Machine test as the motion of a scene's position-controlled tool, with depth of contact, noise and frames.
 
+The first rows define the noise that a force in contact exceeds. A clamp may pull already in these, so standard
+deviations of frames are estimated from all rows.
+
 The tool moves along a line, and its travel is max(0, depth - depth of contact). An instrument starts at first contact
 with the sheet at rest; a clamp starts at its rest, and its depth of contact is that of the first row.
 
 Frames are equidistant in time. Equilibria without relaxation do not depend on time: their frames are equidistant in
 depth, from slightly before contact to the greatest depth; later rows are ignored. Depth and force of a frame are means
-over the rows within half a frame, or interpolated if there are none.
+over the rows within half a frame, or interpolated if there are none. The tool is at rest at the first frame.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -28,8 +30,20 @@ FRAMES_PER_SECOND, MAX_FRAMES = 10.0, 200
 # Number of frames that are equidistant in depth.
 DEPTH_FRAMES = 100
 
+# Standard deviation of normal errors over their median magnitude.
+NORMAL_FACTOR = 1.48
+
 # Smallest force in contact, in units of the noise.
 CONTACT_NOISES = 5.0
+
+# Share of the travel that frames begin before the contact; largest share at an estimated contact.
+CONTACT_SHARE, MAX_CONTACT_SHARE = 0.05, 0.5
+
+# Largest share of a frame that the tool has travelled at the first frame.
+MAX_FIRST_TRAVEL = 0.05
+
+# Accuracy of predicted forces, as a share of the peak.
+FORCE_ACCURACY = 1e-5
 
 
 @dataclass(frozen=True, eq=False)
@@ -122,8 +136,14 @@ class Loading:
         time: time of the test at every frame [s], shape (frames,).
         depth: depth at every frame, as in the table [m], shape (frames,).
         force: measured force along the tool's direction at every frame [N], shape (frames,).
+        sigma: standard deviation of the force at every frame [N], shape (frames,).
+        sigma_freedom: degrees of freedom of the estimate of sigma.
+        information: number of independent forces per frame, shape (frames,): 1, less for frames that share rows, 0 for
+            a frame between rows and for a first frame in contact.
+        offset: force of the table without contact [N], subtracted from all forces.
         noise: standard deviation of the force in the first rows [N].
         contact: depth of contact, as in the table [m].
+        finds_contact: whether the depth of contact is estimated from the noise.
     """
 
     test: MachineTest
@@ -131,19 +151,23 @@ class Loading:
     time: Array
     depth: Array
     force: Array
+    sigma: Array
+    sigma_freedom: float
+    information: Array
+    offset: float
     noise: float
     contact: float
+    finds_contact: bool
 
     @property
     def peak(self) -> float:
         """Largest measured force of a frame [N]."""
         return float(self.force.max())
 
-    @property
-    def sigma(self) -> float:
-        """Standard deviation of measured minus predicted forces [N]."""
-        # Predicted forces have an accuracy of 1e-5 of the peak.
-        return max(self.noise, 1e-5 * self.peak)
+    def without_offset(self, offset: float) -> Loading:
+        """Return the test with a further offset [N] subtracted from its forces."""
+        test = replace(self.test, force=self.test.force - offset)
+        return replace(self, test=test, force=self.force - offset, offset=self.offset + offset)
 
     def travel(self, contact: float | None = None) -> Array:
         """Return the travel of the tool [m], shape (frames,); `contact`: another depth of contact [m]."""
@@ -171,10 +195,9 @@ def build_loading(
     """
     first = test.force[: _count_noise_rows(test)]
     offset = float(np.median(first))
-    # 1.48 converts the median magnitude of normal errors to their standard deviation.
-    noise = max(1.48 * float(np.median(np.abs(first - offset))), test.digit)
+    noise = max(NORMAL_FACTOR * float(np.median(np.abs(first - offset))), test.digit)
     test = replace(test, force=test.force - offset, time=test.time - test.time[0])
-    peak = int(test.force.argmax())
+    peak, finds_contact = int(test.force.argmax()), contact is None and not is_clamp
     if contact is not None and not test.depth.min() <= contact < test.depth.max():
         limits = f"{test.depth.min():.4g} to {test.depth.max():.4g} m"
         raise SceneError([f"--contact {contact:g}: {test.name}: the depths of the table are {limits}"])
@@ -187,13 +210,19 @@ def build_loading(
         )
         raise SceneError([f"{test.name}: {fault} Choose another depth by --columns, or change its sign"])
     if rate is None and scene.time.at_rest and not (scene.tissue and scene.tissue.relaxation):
-        return _sample_in_depth(test, noise, contact)
-    if rate is None:
-        rate = min(FRAMES_PER_SECOND, MAX_FRAMES / float(test.time[-1]))
-    frames = max(1, math.ceil(float(test.time[-1]) * rate - 1e-6))
-    time = np.arange(frames + 1) / rate
-    depth, force = _means(test.time, time, 0.5 / rate, (test.depth, test.force))
-    return Loading(test, rate, time, depth, force, noise, contact)
+        frames, rate = _sample_in_depth(test, noise, contact, finds_contact=finds_contact)
+    else:
+        rate = rate or min(FRAMES_PER_SECOND, MAX_FRAMES / float(test.time[-1]))
+        time = np.arange(max(1, math.ceil(float(test.time[-1]) * rate - 1e-6)) + 1) / rate
+        frames = _means(test.time, time, 0.5 / rate, test)._replace(time=time)
+    information = frames.information
+    if frames.depth[0] - contact > MAX_FIRST_TRAVEL * (frames.depth[1] - frames.depth[0]):
+        information[0] = 0.0
+    deviation, freedom = _row_deviation(test, max(1, len(test.force) // max(3 * len(frames.force), 10)))
+    # Rounding to a digit has a standard deviation of 12^(-1/2).
+    least = max(test.digit / math.sqrt(12), FORCE_ACCURACY * float(frames.force.max()))
+    sigma = np.maximum(deviation / np.sqrt(np.where(frames.rows > 0, frames.rows, 1.0)), least)
+    return Loading(test, rate, *frames[:3], sigma, freedom, information, offset, noise, contact, finds_contact)
 
 
 def require_plausible_travel(loading: Loading, scene: Scene) -> None:
@@ -253,30 +282,91 @@ def late_contact_note(loading: Loading, key: str) -> str | None:
     )
 
 
-def _sample_in_depth(test: MachineTest, noise: float, contact: float) -> Loading:
-    """Sample a test at equidistant depths, up to the greatest one."""
-    rows = int(test.depth.argmax()) + 1
-    deepest = float(test.depth[rows - 1])
-    first = max(contact - 0.05 * (deepest - contact), float(test.depth[:rows].min()))
-    depth = np.linspace(first, deepest, DEPTH_FRAMES + 1)
-    order = np.argsort(test.depth[:rows], kind="stable")
-    half = 0.5 * (depth[1] - depth[0])
-    columns = [values[:rows][order] for values in (test.depth, test.force, test.time)]
-    depth, force, time = _means(columns[0], depth, half, columns)
-    return Loading(test, DEPTH_FRAMES / max(float(test.time[rows - 1]), 1e-3), time, depth, force, noise, contact)
+class _Frames(NamedTuple):
+    """Means over the rows of every frame, each of shape (frames,).
+
+    Attributes:
+        time: time [s].
+        depth: depth [m].
+        force: force [N].
+        rows: number of rows, with those of several frames in equal parts.
+        information: `rows` as a share of all rows of the frame; 0 without rows.
+    """
+
+    time: Array
+    depth: Array
+    force: Array
+    rows: Array
+    information: Array
 
 
-def _means(coordinate: Array, at: Array, half_width: float, columns: Sequence[Array]) -> list[Array]:
-    """Return columns at coordinates `at`, shape (n,): means over the rows within `half_width`, else interpolated.
+def _sample_in_depth(test: MachineTest, noise: float, contact: float, *, finds_contact: bool) -> tuple[_Frames, float]:
+    """Sample a test at equidistant depths, up to the greatest one; return the frames, and their number per second."""
+    last = int(test.depth.argmax()) + 1
+    deepest, share = float(test.depth[last - 1]), CONTACT_SHARE
+    if finds_contact:
+        # The force of a ball rises with the cube of the depth or less, and exceeds the noise first at the contact.
+        late = min((CONTACT_NOISES * noise / float(test.force[:last].max())) ** (1 / 3), MAX_CONTACT_SHARE)
+        share += late / (1 - late)
+    depth = np.linspace(
+        max(contact - share * (deepest - contact), float(test.depth[:last].min())), deepest, DEPTH_FRAMES + 1
+    )
+    half, order = 0.5 * (depth[1] - depth[0]), np.argsort(test.depth[:last], kind="stable")
+    pressed = replace(test, time=test.time[order], depth=test.depth[order], force=test.force[order])
+    frames = _means(pressed.depth, depth, half, pressed)
+    count = _count_noise_rows(test)
+    if test.depth[:count].max() < depth[0] - 1.01 * half:
+        # The first rows, with a median of 0, belong to the first frame. The variance of a median is pi / 2 times that
+        # of a mean.
+        rows = frames.rows[0] + 2 / math.pi * count
+        frames.force[0] *= frames.rows[0] / rows
+        frames.rows[0] = rows
+    return frames, DEPTH_FRAMES / max(float(test.time[last - 1]), 1e-3)
+
+
+def _means(coordinate: Array, at: Array, half_width: float, test: MachineTest) -> _Frames:
+    """Return means over the rows within `half_width` of coordinates `at`, shape (frames,); interpolate without rows.
 
     `coordinate`, shape (rows,), is the position of a row, and increases.
     """
     # Rows on the border of two frames belong to both, up to rounding.
     reach = half_width * (1 + 1e-6)
     low, high = np.searchsorted(coordinate, at - reach, "left"), np.searchsorted(coordinate, at + reach, "right")
-    means = []
-    for column in columns:
-        sums = np.append(0.0, np.cumsum(column))
-        mean = (sums[high] - sums[low]) / np.maximum(high - low, 1)
-        means.append(np.where(high > low, mean, np.interp(at, coordinate, column)))
-    return means
+
+    def sums(column: Array) -> Array:
+        total = np.append(0.0, np.cumsum(column))
+        return np.asarray(total[high] - total[low])
+
+    count = np.maximum(high - low, 1)
+    starts, ends = (np.bincount(rows, minlength=len(coordinate) + 1) for rows in (low, high))
+    own = sums(1 / np.maximum(np.cumsum(starts - ends)[:-1], 1))
+    time, depth, force = (
+        np.where(high > low, sums(column) / count, np.interp(at, coordinate, column))
+        for column in (test.time, test.depth, test.force)
+    )
+    return _Frames(time, depth, force, own, own / count)
+
+
+def _row_deviation(test: MachineTest, size: int) -> tuple[float, float]:
+    """Return the standard deviation of the errors of a row [N], from means of `size` rows, and its degrees of freedom.
+
+    These are distances from cubics through the four neighbouring means: they do not depend on a ramp, unlike the spread
+    of the first rows, and slow errors count fully.
+    """
+    count = len(test.force) // size
+    means = (column[: count * size].reshape(count, size).mean(axis=1) for column in (test.time, test.force))
+    time, force = (np.lib.stride_tricks.sliding_window_view(column, 5) for column in means)
+    weights = np.ones(time.shape)
+    for n in (0, 1, 3, 4):
+        for m in {0, 1, 3, 4} - {n}:
+            weights[:, n] *= (time[:, 2] - time[:, m]) / (time[:, n] - time[:, m])
+    weights[:, 2] = -1.0
+    distances = (weights * force).sum(axis=1) / np.linalg.norm(weights, axis=1)
+    distances = np.abs(distances)
+    deviation = NORMAL_FACTOR * float(np.median(distances))
+    for _ in range(5):
+        # Corners of the ramp are beyond three standard deviations; 0.9866 is that of a normal error within three.
+        kept = distances[distances <= 3 * deviation]
+        deviation = float(np.sqrt(np.mean(kept**2))) / 0.9866
+    # The sum of the squared autocorrelations of the distances is 2.63.
+    return deviation * math.sqrt(size), len(distances) / 2.63

@@ -18,9 +18,11 @@ from numpy.typing import NDArray
 
 from taichi_msm.errors import Problem
 from taichi_msm.images import file_sha256, read_grey
+from taichi_msm.laws.law import LawNumbers
 from taichi_msm.scene.scene import Scene
 from taichi_msm.scene.section import MAX_POINTS, Side
 from taichi_msm.scene.sheet import Sheet, StiffnessMap
+from taichi_msm.system.array_cache import cached_arrays
 
 # Largest number of branches of the stress relaxation.
 MAX_BRANCHES = 4
@@ -94,13 +96,6 @@ class MapImage(NamedTuple):
 Maps = Mapping[str, MapImage]
 
 
-class LockNumbers(NamedTuple):
-    """Parameters of a locking law, see `terms.law`."""
-
-    lock: float  # elongation m at which the law locks: strain of a spring, or depth of the foundation [m]
-    factor: float  # largest tangent stiffness, relative to the initial one
-
-
 class Springs(NamedTuple):
     """The springs of a sheet as arrays, in four families.
 
@@ -127,9 +122,9 @@ class Material:
     virtual: float  # stiffness K of the virtual springs [N/m]; 0 if they are never active
     always_active: bool  # whether the virtual springs are always active; else only under load
     bending: float  # bending stiffness D times the area of a cell, D dx dy [N m3]
-    stiffening: LockNumbers | None  # locking law of the springs; None if they are linear
+    stiffening: LawNumbers | None  # law of the springs; None if they are linear
     relaxation: tuple[tuple[float, float], ...]  # share and time [s] of every branch
-    virtual_stiffening: LockNumbers | None  # locking law of the virtual springs; None if they are linear
+    virtual_stiffening: LawNumbers | None  # law of the virtual springs; None if they are linear
     by_area: bool  # whether mass points and springs at an edge are lighter and softer, as with `tissue`
     factors: Array | None  # factor of the stiffness of every cell, shape (rows - 1, cols - 1); None without a map
     virtual_factors: Array | None  # factor of K at every mass point, shape (rows, cols); None without a map
@@ -155,7 +150,8 @@ def read_map(stiffness_map: StiffnessMap) -> MapImage:
         PictureError: when the file is missing, unreadable or not a grey image.
     """
     sha256 = file_sha256(stiffness_map.image)
-    return MapImage(read_grey(stiffness_map.image, sha256), sha256)
+    (grey,) = cached_arrays(("map", sha256), lambda: (read_grey(stiffness_map.image, sha256),))
+    return MapImage(grey, sha256)
 
 
 def cell_factors(stiffness_map: StiffnessMap, image: MapImage, sheet: Sheet) -> Array:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import replace
 from functools import partial
@@ -19,6 +19,7 @@ from taichi_msm.accuracy.companions import QUASISTATIC_REASON, CompanionRuns, ch
 from taichi_msm.accuracy.path_dependence import PathDependence
 from taichi_msm.accuracy.run_errors import RunErrorEstimates, RunErrorEstimator, run_warnings
 from taichi_msm.errors import (
+    ArgumentError,
     DamagedError,
     DeviceError,
     DivergedError,
@@ -27,6 +28,7 @@ from taichi_msm.errors import (
     SceneError,
     StageProgressCallback,
     require_path,
+    require_type,
     writing,
 )
 from taichi_msm.load import cost
@@ -128,6 +130,10 @@ def run(
         >>> record["status"], record["frames"], record["precision"]
         ('complete', 31, 'f64')
     """
+    require_type(estimate_error, bool | None, "estimate_error", "True, False or None")
+    if not isinstance(overrides, (list, tuple)) or not all(isinstance(text, str) for text in overrides):
+        raise ArgumentError(f'overrides: {overrides!r}; take a list of texts, such as ["sheet.points=[61,61]"]')
+    _require_callbacks(started, progress)
     stopwatch = Stopwatch(started)
     plan = check_scene(scene)
     require_path(directory)
@@ -182,6 +188,7 @@ def resume(
         FilesError: when the unfinished run is missing or damaged; and as for `run`.
         KeyboardInterrupt: when interrupted before another frame is finished; nothing has changed then.
     """
+    _require_callbacks(started, progress)
     stopwatch = Stopwatch(started)
     require_path(directory)
     manifest, plan = read_manifest(Path(directory))
@@ -192,6 +199,11 @@ def resume(
     device = runtime.start(manifest.arch, threads)
     context = _RunContext(_add_current_versions(manifest), plan, texture, device, Path(directory))
     return _execute(context, stopwatch, progress, resumes=True)
+
+
+def _require_callbacks(started: float | None, progress: StageProgressCallback) -> None:
+    require_type(started, int | float | None, "started", "a value of time.perf_counter() or None")
+    require_type(progress, Callable, "progress", "a function")
 
 
 def _find_unfinished(context: _RunContext) -> Manifest | None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import io
 import math
 from base64 import b64encode
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from itertools import count
 from string import Template
@@ -26,6 +26,7 @@ from taichi_msm.errors import (
     as_array,
     is_real_array,
     require_frame_count,
+    require_type,
 )
 from taichi_msm.load.check import check_scene
 from taichi_msm.load.resolve import resolve
@@ -86,6 +87,7 @@ class Simulation:
         texture: NDArray[np.uint8] | None = None,
         cores: int | None = None,
     ) -> None:
+        require_type(cores, int | None, "cores", "a whole number, 1 or more, or None")
         plan = check_scene(scene)
         texture = None if texture is None else require_texture(texture)
         self.device = runtime.start(arch, threads)
@@ -157,6 +159,7 @@ class Simulation:
                 converge. `positions` and `draw` then return the last valid frame.
         """
         require_frame_count(frames)
+        require_type(pause, Callable, "pause", "a function")
         self._require_open()
         self._solve_first_frame(pause)
         for _ in range(frames):

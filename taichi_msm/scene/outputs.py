@@ -181,6 +181,11 @@ def is_result(results: Collection[str], frames: int, name: str) -> bool:
     return folder in results and int(number) < output.count(frames)
 
 
+def is_formula(text: str) -> bool:
+    """Return whether a spreadsheet takes the text of a CSV cell for a formula."""
+    return text.startswith(("=", "+", "-", "@", "\t", "\r"))
+
+
 def zero_padded(number: int) -> str:
     """Format the number of a run of a sweep, or of an item of an export, for the name of its file or folder."""
     return f"{number:06}"

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import Executor
 from contextlib import contextmanager
 from pathlib import Path
@@ -14,6 +14,7 @@ from taichi_msm.errors import (
     NotInstalledError,
     StageProgressCallback,
     require_path,
+    require_type,
     writing,
 )
 from taichi_msm.sweeps.pool import Pool
@@ -85,6 +86,9 @@ def sweep(
         raise ArgumentError(f"scene: {scene!r}; take the path of a scene file")
     if workers is not None and not (type(workers) is int and 1 <= workers <= MAX_WORKERS):
         raise ArgumentError(f"workers: {workers!r}; take a whole number, 1 to {MAX_WORKERS}, or None")
+    if executor is not None and not isinstance(executor, str) and not hasattr(executor, "submit"):
+        raise ArgumentError(f"executor: {executor!r}; take None, an address or an executor with submit")
+    require_type(progress, Callable, "progress", "a function")
     settings = {"variables": variables or {}, "vary": vary, "seed": seed, "set": overrides or {}}
     settings |= {} if samples is None else {"samples": samples}
     spec = make_sweep(scene, settings)

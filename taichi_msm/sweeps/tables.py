@@ -22,7 +22,7 @@ from taichi_msm.load import cost
 from taichi_msm.load.scene_file import plan_file
 from taichi_msm.model.plan import Plan
 from taichi_msm.runs.directory import MAX_RECORD_BYTES, replacing
-from taichi_msm.scene.outputs import RUN_RECORD
+from taichi_msm.scene.outputs import RUN_RECORD, is_formula
 from taichi_msm.sweeps import plots
 from taichi_msm.sweeps.expressions import replace_expressions
 from taichi_msm.sweeps.runs import REPORT_FILES, STATUSES, Outcome, SweepState
@@ -102,8 +102,15 @@ def write_table(state: SweepState) -> None:
     """Write table.csv, with a row for each run."""
     columns = _columns(state)
     for name in state.sweep.keys:
-        columns[name] = list(map(format_override, columns[name]))
+        columns[name] = list(map(format_cell, columns[name]))
+    columns["error"] = [f"'{error}" if is_formula(error) else error for error in columns["error"]]
     _write_csv(state.directory / "table.csv", [list(columns), *zip(*columns.values(), strict=True)])
+
+
+def format_cell(value: Any) -> str:
+    """Format a value for `--set`, a text in quotes if a spreadsheet would take it for a formula."""
+    text = format_override(value)
+    return json.dumps(value, ensure_ascii=False) if isinstance(value, str) and is_formula(text) else text
 
 
 def write_parquet(state: SweepState, written: list[str]) -> list[str]:

@@ -17,7 +17,6 @@ from taichi_msm.model.plan import Plan
 from taichi_msm.model.sheet import Material
 from taichi_msm.scene.scene import Scene
 from taichi_msm.scene.sheet import Sheet
-from taichi_msm.terms.law import Law, LawFunctions
 
 # Rows of the array `by_column`. MOBILITY and AREA_SHARE take three: for the first, inner and last rows of the sheet.
 # With `KernelConfig.by_point` both are the first fields instead.
@@ -234,26 +233,10 @@ class KernelConfig:
 
     @property
     def operations(self) -> Operations:
-        """The operations of Taichi for laws and shapes."""
-        ti, lanes = self.ti, self.lanes
+        """The operations of kernels, imported lazily as `ti`."""
+        from taichi_msm.system.kernel_operations import KERNEL
 
-        @ti.func
-        def log(values):
-            result = values
-            for lane in ti.static(range(lanes)):
-                result[lane] = ti.log(values[lane])
-            return result
-
-        return Operations(ti.sqrt, log, ti.max, ti.min, ti.select, ti.func)
-
-    def compile_law(self, law: Law, *, tense: bool) -> LawFunctions:
-        """Return the functions of a law as Taichi functions.
-
-        Args:
-            law: law of the springs.
-            tense: whether the springs are under tension at rest.
-        """
-        return LawFunctions(*(self.ti.func(function) for function in law.build(self.operations, tense=tense)))
+        return KERNEL
 
     def get(self, kind: type[AnyTerm]) -> AnyTerm | None:
         """Return the term of a class; None if the scene does not have it."""

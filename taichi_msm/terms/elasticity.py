@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from taichi_msm.arithmetic import NUMPY
 from taichi_msm.model.plan import Plan
 from taichi_msm.model.sheet import rest_positions, spacing
-from taichi_msm.terms.law import LawFunctions, law_parameters, spring_law
+from taichi_msm.terms.law import SpringFunctions, build_spring
 from taichi_msm.terms.springs import Window, assemble_springs, spring_ends
 
 Array = NDArray[np.float64]
@@ -35,8 +35,8 @@ class SpringFamily(NamedTuple):
     length: Array  # at rest [m], shape (...)
     stiffness: Array  # k - tau of each spring [N/m], shape (...) as selected by `start`
     tension: Array  # tau of each spring, its tension at rest divided by its length [N/m], shape (...)
-    law: LawFunctions
-    parameters: tuple[float, ...]  # of the law
+    functions: SpringFunctions
+    numbers: tuple[Any, ...]  # `LawNumbers.constants` of each spring; () without a law
 
     def elongation(self, displacement: Array) -> Elongation:
         """Compute the elongation of each spring; displacement: x - X [m], shape (rows, cols, 3)."""
@@ -51,27 +51,10 @@ class SpringFamily(NamedTuple):
         along = axial[..., None, None] * edges[..., :, None] * edges[..., None, :]
         return (isotropic + self.tension)[..., None, None] * np.eye(3) + along
 
-    def derivatives(self, square_difference: Array, square: Array, along: Array | float) -> tuple[Array, ...]:
-        """Return `LawFunctions.derivatives` for each spring, shape (...) each.
-
-        Args:
-            square_difference: L^2 - L0^2 [m2], shape (...).
-            square: L^2 [m2], shape (...).
-            along: (o + q) . p for a displacement p of an end [m2], shape (...).
-        """
-        return self.law.derivatives(
-            self.stiffness, self.tension, square_difference, square, self.length, along, *self.parameters
-        )
-
-    def parameter_derivatives(self, square_difference: Array, square: Array) -> tuple[Array, Array]:
-        """Return `LawFunctions.parameter_derivatives` for each spring, shape (...) each.
-
-        Args:
-            square_difference: L^2 - L0^2 [m2], shape (...).
-            square: L^2 [m2], shape (...).
-        """
-        return self.law.parameter_derivatives(
-            self.stiffness, self.tension, square_difference, square, self.length, *self.parameters
+    def derivatives(self, square_difference: Array, square: Array, along: Array | float) -> tuple[Any, ...]:
+        """Return `SpringFunctions.derivatives` for each spring, shape (...) each; `along` is (o + q) . p [m2]."""
+        return self.functions.derivatives(
+            self.stiffness, self.tension, square_difference, square, self.length, along, self.numbers
         )
 
     def energy(self, displacement: Array) -> Array:
@@ -82,20 +65,21 @@ class SpringFamily(NamedTuple):
         """
         q, _, square_difference, _ = self.elongation(displacement)
         square_strain = square_difference / self.length**2
-        stretched = self.law.energy(self.stiffness, self.tension, square_strain, *self.parameters)
+        stretched = self.functions.energy(self.stiffness, self.tension, square_strain, self.numbers)
         return (stretched * self.length**2 + self.tension * (q**2).sum(axis=-1)) / 2
 
 
 def spring_families(plan: Plan) -> Iterator[SpringFamily]:
     """Build the families of springs along rows, along columns and along both diagonals."""
     material, sheet = plan.material, plan.scene.sheet
-    springs, law = assemble_springs(material, sheet.points), spring_law(material.stiffening).build(NUMPY)
+    springs, law = assemble_springs(material, sheet.points), material.stiffening
+    functions = build_spring(law.law if law else None, NUMPY)
     rest = rest_positions(sheet) if springs.rest is None else springs.rest
     for k, tension, (start, end) in zip(springs.stiffness, springs.tension, spring_ends(sheet.points), strict=True):
         offset = rest[end] - rest[start]
         length = np.sqrt((offset**2).sum(axis=-1))
-        parameters = law_parameters(material.stiffening, length)
-        yield SpringFamily(start, end, offset, length, k - tension, tension, law, parameters)
+        numbers = law.constants(length) if law else ()
+        yield SpringFamily(start, end, offset, length, k - tension, tension, functions, numbers)
 
 
 def energy_density(plan: Plan, displacement: Array) -> Array:

@@ -10,21 +10,25 @@ Scene: `springs.virtual` and `virtual_active`, or `tissue.foundation`, `foundati
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 from typing_extensions import Self
 
 from taichi_msm.arithmetic import NUMPY
+from taichi_msm.laws import law_of
+from taichi_msm.laws.law import Law, LawNumbers
 from taichi_msm.model.loads import Schedule
 from taichi_msm.model.plan import Plan
 from taichi_msm.model.sheet import Material, spacing
 from taichi_msm.scene.scene import Scene
-from taichi_msm.scene.sheet import Foundation, Sheet
+from taichi_msm.scene.sheet import Sheet
 from taichi_msm.terms.base import KernelConfig, Term
-from taichi_msm.terms.law import LockingLaw, build_locking, law_parameters, make_stiffening
+from taichi_msm.terms.law import build_law
 from taichi_msm.terms.points import build_point_functions
+
+Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
@@ -35,17 +39,15 @@ class FoundationTerm(Term):
 
     by_area: bool  # whether K is smaller at an open edge, because mass points have less area there
     mapped: bool  # whether the factor of K at each mass point is read from a field
-    locks: bool = False  # whether it stiffens when it is pressed in
+    law: Law | None = None  # when it is pressed in; None if it is linear
 
     @staticmethod
     def derive(scene: Scene) -> dict[str, Any]:
         """Derive K [N/m], 0 if the foundation is never active; whether it is always active; and its law."""
-        stiffening = None
+        stiffening: LawNumbers | None = None
         if scene.tissue is not None:
             k = scene.tissue.foundation_stiffness * math.prod(spacing(scene.sheet))
-            active, foundation = scene.tissue.foundation_active, scene.tissue.foundation
-            if isinstance(foundation, Foundation):
-                stiffening = make_stiffening(foundation.lock, foundation.factor)
+            active, stiffening = scene.tissue.foundation_active, law_of(scene.tissue.foundation)
         else:
             assert scene.springs is not None
             k, active = scene.springs.virtual, scene.springs.virtual_active
@@ -60,7 +62,7 @@ class FoundationTerm(Term):
         if material.virtual == 0:
             return None
         by_area = plan.areas_vary and material.by_area and not mapped
-        return cls(by_area, mapped, material.virtual_stiffening is not None)
+        return cls(by_area, mapped, material.virtual_stiffening.law if material.virtual_stiffening else None)
 
     @staticmethod
     def stiffness_bound(material: Material, sheet: Sheet) -> float:
@@ -88,10 +90,11 @@ class FoundationTerm(Term):
 
     @property
     def constant_count(self) -> int:  # type: ignore[override]
-        return LockingLaw.parameter_count if self.locks else 0
+        return 2 + self.law.shape_count if self.law else 0
 
     def constants(self, plan: Plan) -> tuple[float, ...]:
-        return law_parameters(plan.material.virtual_stiffening, 1.0)
+        law = plan.material.virtual_stiffening
+        return law.constants(1.0) if law else ()
 
     def build_forces(self, config: KernelConfig) -> Sequence[Callable[..., Any]]:
         return (self._build_add(config, tangent=False),)
@@ -100,16 +103,17 @@ class FoundationTerm(Term):
         return (self._build_add(config, tangent=True),)
 
     def _build_add(self, config: KernelConfig, *, tangent: bool) -> Callable[..., Any]:
-        ti, locks, column = config.ti, self.locks, config.first_column(FoundationTerm)
-        stiffness_at, (secant, slope) = self.build_stiffness(config), self._build_law(config)
-        ratio = slope if tangent else secant
+        ti, has_law, column = config.ti, self.law is not None, config.first_column(FoundationTerm)
+        stiffness_at, (secant, slope, _) = self.build_stiffness(config), self._build_law(config)
 
         @ti.func
         def add(force: ti.template(), sheet: ti.template(), entry: ti.template(), now: ti.template()):
             k, u = stiffness_at(sheet, entry, now[column]), ti.static(entry.displacement if tangent else entry.u)
             for c in ti.static(range(3)):
-                if ti.static(locks and c == 2):
-                    force[c] = force[c] - k * (entry.u[c] * ratio(sheet, u[2]))
+                if ti.static(has_law and c == 2 and tangent):
+                    force[c] = force[c] - k * (entry.u[c] * slope(sheet, u[2]))
+                elif ti.static(has_law and c == 2):
+                    force[c] = force[c] - k * (entry.u[c] * secant(sheet, u[2]))
                 else:
                     force[c] = force[c] - k * entry.u[c]
 
@@ -118,22 +122,22 @@ class FoundationTerm(Term):
     def build_derivatives(self, config: KernelConfig) -> Callable[..., Any]:
         """Build the Taichi function derive(sheet, p, u), which differentiates -p . force.
 
-        It returns the derivatives with respect to K, log(lock) and the factor, the latter two divided by K.
+        It returns the derivatives with respect to K, log m and the shape of the law, divided by K but the first.
         """
-        ti, locks, first = config.ti, self.locks, config.first_constant(FoundationTerm)
-        secant, tangent = self._build_law(config)
+        ti, has_law, count = config.ti, self.law is not None, self.law.shape_count if self.law else 0
+        secant, tangent, by_shape = self._build_law(config)
 
         @ti.func
         def derive(sheet: ti.template(), p: ti.template(), u: ti.template()):
-            by_k = p[0] * u[0] + p[1] * u[1] + p[2] * u[2]
-            by_lock, by_factor = 0 * u[2], 0 * u[2]
-            if ti.static(locks):
-                ratio = secant(sheet, u[2])
+            if ti.static(has_law):
+                ratio, slope = secant(sheet, u[2]), tangent(sheet, u[2])
+                depth = p[2] * u[2]
+                by_numbers = by_shape(sheet, u[2])
+                by_law = [depth * by_numbers[n] for n in ti.static(range(count))]
                 by_k = p[0] * u[0] + p[1] * u[1] + p[2] * (u[2] * ratio)
-                by_lock = p[2] * u[2] * (ratio - tangent(sheet, u[2]))
-                end = sheet.constants[first + 1] / sheet.constants[first]
-                by_factor = p[2] * ti.min(u[2] + end, 0)
-            return [by_k, by_lock, by_factor]
+                return [by_k, depth * (ratio - slope)] + by_law  # noqa: RUF005  # Taichi nests an unpacked list.
+            else:  # noqa: RET505
+                return [p[0] * u[0] + p[1] * u[1] + p[2] * u[2]]
 
         return derive
 
@@ -153,89 +157,64 @@ class FoundationTerm(Term):
 
         return stiffness_at
 
-    def _build_law(self, config: KernelConfig) -> tuple[Callable[..., Any], Callable[..., Any]]:
-        """Build the Taichi functions secant(sheet, u_z) and tangent(sheet, u_z) of a foundation that locks."""
-        ti, first, law = config.ti, config.first_constant(FoundationTerm), build_locking(config.operations)
+    def _build_law(self, config: KernelConfig) -> tuple[Callable[..., Any], ...]:
+        """Build the Taichi functions secant(sheet, u_z), tangent(sheet, u_z) and by_shape(sheet, u_z) of a law."""
+        if self.law is None:
+            return (_no_law,) * 3
+        ti, first, functions = config.ti, config.first_constant(FoundationTerm), build_law(self.law, config.operations)
+        count = self.law.shape_count
 
         def of_depth(function: Callable[..., Any]) -> Callable[..., Any]:
-            law_function = ti.func(function)
-
             @ti.func
             def at(sheet: ti.template(), u):
-                return law_function(0 - u * sheet.constants[first], sheet.constants[first + 1])
+                shape = [sheet.constants[first + 2 + n] for n in ti.static(range(count))]
+                # ti.static takes expressions in a list only.
+                return ti.static([function(0 - u * sheet.constants[first], shape)])[0]
 
             return at
 
-        return of_depth(law.secant), of_depth(law.tangent)
+        return of_depth(functions.secant), of_depth(functions.tangent), of_depth(functions.by_shape)
+
+
+def _no_law() -> None:
+    """Stand in for the functions of a law, which a linear foundation does not call."""
 
 
 def _steepest(material: Material) -> float:
     """Return the largest tangent stiffness for a factor of 1 [N/m]."""
-    stiffening = material.virtual_stiffening
-    return material.virtual * (1.0 if stiffening is None else stiffening.factor)
+    law = material.virtual_stiffening
+    return material.virtual * (law.largest_slope if law else 1.0)
 
 
-def foundation_force(material: Material, k: NDArray[Any] | float, displacement: NDArray[Any]) -> NDArray[Any]:
-    """Return the force of the foundation on each mass point [N], shape (rows, cols, 3).
+class FoundationForce(NamedTuple):
+    """Force of the foundation on each mass point, and its derivatives."""
 
-    Args:
-        material: coefficients of the sheet.
-        k: stiffness [N/m], a number or shape (rows, cols).
-        displacement: x - X [m], shape (rows, cols, 3).
-    """
-    force = -np.asarray(k)[..., None] * displacement
-    if material.virtual_stiffening is not None:
-        scale, end, _ = law_parameters(material.virtual_stiffening, 1.0)
-        force[..., 2] *= build_locking(NUMPY).secant(-displacement[..., 2] * scale, end)
-    return force
+    force: Array  # [N], shape (rows, cols, 3)
+    tangent: Array  # diagonal of the stiffness matrix [N/m], shape (rows, cols, 3)
+    by_numbers: list[Array]  # derivatives of the z component by log m and the shape of the law [N], shape (rows, cols)
 
 
-def foundation_energy(material: Material, k: NDArray[Any] | float, displacement: NDArray[Any]) -> float:
-    """Return the energy of the foundation [J].
+def foundation_force(material: Material, k: Array, displacement: Array) -> FoundationForce:
+    """Return the force of a foundation of the stiffness k [N/m], shape (rows, cols), and its derivatives."""
+    tangent, law = np.repeat(k[..., None], 3, axis=-1), material.virtual_stiffening
+    force, by_numbers = -tangent * displacement, []
+    if law is not None:
+        functions, (scale, _, *shape), u_z = build_law(law.law, NUMPY), law.constants(1.0), displacement[..., 2]
+        x = -u_z * scale
+        secant, slope = functions.secant(x, shape), functions.tangent(x, shape)
+        by_numbers = [-k * u_z * by for by in (secant - slope, *functions.by_shape(x, shape))]
+        force[..., 2] *= secant
+        tangent[..., 2] *= slope
+    return FoundationForce(force, tangent, by_numbers)
 
-    Args:
-        material: coefficients of the sheet.
-        k: stiffness [N/m], a number or shape (rows, cols).
-        displacement: x - X [m], shape (rows, cols, 3).
-    """
-    square = displacement**2
-    if material.virtual_stiffening is not None:
-        scale, end, lock = law_parameters(material.virtual_stiffening, 1.0)
-        square[..., 2] = lock**2 * build_locking(NUMPY).energy(-displacement[..., 2] * scale, end)
+
+def foundation_energy(material: Material, k: Array | float, displacement: Array) -> float:
+    """Return the energy of a foundation of the stiffness k [N/m], a number or shape (rows, cols) [J]."""
+    square, law = displacement**2, material.virtual_stiffening
+    if law is not None:
+        scale, depth, *shape = law.constants(1.0)
+        square[..., 2] = depth**2 * law.law.build(NUMPY).integral(-displacement[..., 2] * scale, *shape)
     return float((k * square.sum(axis=-1)).sum()) / 2
-
-
-def foundation_derivatives(material: Material, k: NDArray[Any], u_z: NDArray[Any]) -> tuple[NDArray[Any], NDArray[Any]]:
-    """Differentiate the z component of `foundation_force` with respect to log(lock) and to the factor.
-
-    Args:
-        material: coefficients of the sheet.
-        k: stiffness [N/m], shape (rows, cols).
-        u_z: z component of x - X [m], shape (rows, cols).
-
-    Returns:
-        Both derivatives [N], shape (rows, cols) each; 0 for a linear foundation.
-    """
-    if material.virtual_stiffening is None:
-        return np.zeros_like(u_z), np.zeros_like(u_z)
-    (scale, end, lock), law = law_parameters(material.virtual_stiffening, 1.0), build_locking(NUMPY)
-    x = -u_z * scale
-    return -k * u_z * (law.secant(x, end) - law.tangent(x, end)), k * lock * np.maximum(x - end, 0)
-
-
-def foundation_tangent(material: Material, k: NDArray[Any], displacement: NDArray[Any]) -> NDArray[Any]:
-    """Return the diagonal of the foundation's stiffness matrix [N/m], shape (rows, cols, 3).
-
-    Args:
-        material: coefficients of the sheet.
-        k: stiffness [N/m], shape (rows, cols).
-        displacement: x - X [m], shape (rows, cols, 3).
-    """
-    tangent = np.repeat(k[..., None], 3, axis=-1)
-    if material.virtual_stiffening is not None:
-        scale, end, _ = law_parameters(material.virtual_stiffening, 1.0)
-        tangent[..., 2] *= build_locking(NUMPY).tangent(-displacement[..., 2] * scale, end)
-    return tangent
 
 
 def point_shares(plan: Plan) -> NDArray[Any]:

@@ -28,24 +28,26 @@ import numpy as np
 from numpy.typing import NDArray
 from typing_extensions import Self
 
+from taichi_msm.laws import law_of
+from taichi_msm.laws.law import Law
 from taichi_msm.model.plan import Plan
 from taichi_msm.model.sheet import Material, Springs, largest_mean, spacing
 from taichi_msm.scene.scene import Scene
 from taichi_msm.scene.sheet import Sheet
 from taichi_msm.terms.base import AREA_SHARE, DX, DY, HAS_LEFT, HAS_RIGHT, KernelConfig, RowPair, Term
-from taichi_msm.terms.law import LINEAR, Law, law_parameters, make_stiffening, spring_law
+from taichi_msm.terms.law import build_spring
 from taichi_msm.terms.points import build_point_functions
 
 # Families of springs with constants of their own, and with fields of their own: the diagonals of a cell differ there.
 ALONG_ROW, ALONG_COLUMN, DIAGONAL = range(3)
 FALLING, RISING, FAMILIES = 2, 3, 4
 
-# Measures: minimum and maximum of (L^2 - L0^2) / L0^2; sum of `LawFunctions.energy` for each family; under tension, sum
-# of tau |q|^2 / L0^2 for each family. On a curved sheet the sums are multiplied by L0^2.
+# Measures: minimum and maximum of (L^2 - L0^2) / L0^2; sum of `SpringFunctions.energy` for each family; under tension,
+# sum of tau |q|^2 / L0^2 for each family. On a curved sheet the sums are multiplied by L0^2.
 MIN_STRAIN, MAX_STRAIN, STRETCH_SUMS, TENSION_SUMS = 0, 1, 2, 5
 
-# Constants, each for all families in turn: k - tau, tau, parameters of the law.
-FIRST_TENSION, FIRST_PARAMETER = 3, 6
+# Constants, each for all families in turn: k - tau, tau, numbers of the law.
+FIRST_TENSION, FIRST_NUMBER = 3, 6
 
 # Prevents a division by 0 at L = 0, where the force becomes 0; representable in f32, the type of literals in kernels.
 MIN_SQUARED_LENGTH = 1e-36
@@ -63,7 +65,7 @@ class SpringTerm(Term):
     by_area: bool  # whether springs along an open edge are softer, because they belong to one cell
     varied: bool  # whether k - tau and tau of every spring are fields, with 0 for springs beyond an edge
     tense: bool  # whether the sheet is under tension at rest
-    law: Law = LINEAR  # of the springs
+    law: Law | None = None  # of the springs; None if they are linear
 
     reach: ClassVar[int] = 1
     reductions: ClassVar[tuple[str, ...]] = ("min", "max", "sum", "sum", "sum", "sum", "sum", "sum")
@@ -75,7 +77,7 @@ class SpringTerm(Term):
 
     @property
     def constant_count(self) -> int:  # type: ignore[override]
-        return FIRST_PARAMETER + 3 * self.law.parameter_count
+        return FIRST_NUMBER + 3 * self._number_count
 
     @staticmethod
     def derive(scene: Scene) -> dict[str, Any]:
@@ -85,13 +87,13 @@ class SpringTerm(Term):
             stiffness = {"across": springs.structural, "down": springs.structural, "shear": springs.shear}
             return {**stiffness, "tension": 0.0, "stiffening": None}
         dx, dy = spacing(scene.sheet)
-        membrane, stiffening = tissue.young * tissue.thickness, tissue.stiffening
+        membrane = tissue.young * tissue.thickness
         return {
             "across": membrane * (9 / 8 * dy / dx - 3 / 8 * dx / dy),
             "down": membrane * (9 / 8 * dx / dy - 3 / 8 * dy / dx),
             "shear": 3 / 16 * membrane * (dx * dx + dy * dy) / (dx * dy),
             "tension": tissue.pretension / (1.5 * membrane),
-            "stiffening": None if stiffening is None else make_stiffening(stiffening.lock, stiffening.factor),
+            "stiffening": law_of(tissue.stiffening),
         }
 
     @classmethod
@@ -104,7 +106,7 @@ class SpringTerm(Term):
             by_area=open_edges and material.by_area,
             varied=material.factors is not None or material.springs is not None,
             tense=material.is_tense,
-            law=spring_law(material.stiffening),
+            law=material.stiffening.law if material.stiffening else None,
         )
 
     @staticmethod
@@ -145,11 +147,11 @@ class SpringTerm(Term):
         material, (dx, dy) = plan.material, spacing(plan.scene.sheet)
         remainder = 1 - material.tension
         stiffness = material.across * remainder, material.down * remainder, material.shear * remainder
-        lengths = dx, dy, math.hypot(dx, dy)
+        lengths, law = (dx, dy, math.hypot(dx, dy)), material.stiffening
         if material.springs is not None and material.springs.rest is not None:
             lengths = 1.0, 1.0, 1.0  # the kernels divide by the length of each spring
-        parameters = (value for length in lengths for value in law_parameters(material.stiffening, length))
-        return *stiffness, *material.tensions, *parameters
+        numbers = (number for length in lengths if law for number in law.constants(length))
+        return *stiffness, *material.tensions, *numbers
 
     @property
     def field_count(self) -> int:
@@ -175,20 +177,25 @@ class SpringTerm(Term):
         dx, dy = spacing(plan.scene.sheet)
         return float(total @ (dx**2, dy**2, dx**2 + dy**2))
 
-    def _build_parameters(self, config: KernelConfig) -> Callable[..., Any]:
-        """Build the Taichi function parameters_of(sheet, family, length), the list of the parameters of the law."""
-        ti, count, first = config.ti, self.law.parameter_count, config.first_constant(SpringTerm) + FIRST_PARAMETER
-        of_length, at_length = config.curved and count > 0, config.compile_law(self.law, tense=self.tense).at_length
+    @property
+    def _number_count(self) -> int:
+        """Number of `LawNumbers.constants`."""
+        return 2 + self.law.shape_count if self.law else 0
+
+    def _build_numbers(self, config: KernelConfig) -> Callable[..., Any]:
+        """Build the Taichi function numbers_of(sheet, family, length), the list of `LawNumbers.constants`."""
+        ti, count, first = config.ti, self._number_count, config.first_constant(SpringTerm) + FIRST_NUMBER
+        of_length = config.curved and count > 0
 
         @ti.func
-        def parameters_of(sheet: ti.template(), family: ti.template(), length):
-            parameters = [sheet.constants[first + count * family + n] for n in ti.static(range(count))]
+        def numbers_of(sheet: ti.template(), family: ti.template(), length):
             if ti.static(of_length):
-                return at_length(length, *parameters)
+                others = [sheet.constants[first + count * family + n] for n in ti.static(range(1, count))]
+                return [sheet.constants[first + count * family] / length] + others  # noqa: RUF005
             else:  # noqa: RET505  # Taichi would compile the rest as well.
-                return parameters
+                return [sheet.constants[first + count * family + n] for n in ti.static(range(count))]
 
-        return parameters_of
+        return numbers_of
 
     def _build_field(self, config: KernelConfig, first: int) -> Callable[..., Any]:
         """Build the Taichi function that reads a field of a family, see `build_stiffness`; `first` is that of rows."""
@@ -266,8 +273,8 @@ class SpringTerm(Term):
         ti, vector, tense, curved = config.ti, config.vector, self.tense, config.curved
         open_edges, tense_edges = self.open_edges, self.tense_edges
         stiffness_of, tension_of = self.build_stiffness(config), self._build_tension(config)
-        parameters_of, rest_position = self._build_parameters(config), build_point_functions(config).rest_position
-        pull = config.compile_law(self.law, tense=tense).pull
+        numbers_of, rest_position = self._build_numbers(config), build_point_functions(config).rest_position
+        pull = build_spring(self.law, config.operations, tense=tense).pull
 
         @ti.func
         def masked(k, exists):
@@ -287,7 +294,7 @@ class SpringTerm(Term):
             """Return the force of the spring `edge`, the vector to the mass point that exerts it."""
             k = masked(stiffness_of(sheet, family, falls, i, kind, b), exists)
             tension = tension_of(sheet, family, falls, i, kind, b, exists)
-            per_length = pull(k, tension, square_difference, square, length, *parameters_of(sheet, family, length))
+            per_length = pull(k, tension, square_difference, square, length, numbers_of(sheet, family, length))
             total = [per_length * edge[c] for c in ti.static(range(3))]
             if ti.static(tense):
                 for c in ti.static(range(3)):
@@ -370,36 +377,30 @@ class SpringTerm(Term):
 
         The map from p to this change is symmetric.
         """
-        ti, tense, count = config.ti, self.tense, self.law.parameter_count
-        law = config.compile_law(self.law, tense=tense)
-        derivatives, parameter_derivatives = law.derivatives, law.parameter_derivatives
-        first_tension, parameters_of = config.first_constant(SpringTerm) + FIRST_TENSION, self._build_parameters(config)
+        ti, tense, count = config.ti, self.tense, self._number_count
+        derivatives = build_spring(self.law, config.operations, tense=tense).derivatives
+        first_tension, numbers_of = config.first_constant(SpringTerm) + FIRST_TENSION, self._build_numbers(config)
+        # One derivative by log m, and one by each number of the shape.
+        by_count = max(0, count - 1)
 
         @ti.func
         def differentiate(
             sheet: ti.template(), family: ti.template(), q: ti.template(), p: ti.template(), x0, y0, length, k
         ):
-            """Return x, y and z of the change, and the derivatives of p . force by k - tau and by tau.
-
-            A locking law has two more, by log(lock) and by the factor.
-            """
+            """Return x, y and z of the change, and the derivatives of p . force by k - tau, tau, log m and shape."""
             edge = [q[0] + x0, q[1] + y0, q[2]]
             square = edge[0] * edge[0] + edge[1] * edge[1] + (edge[2] * edge[2] + MIN_SQUARED_LENGTH)
             square_difference = q[0] * (edge[0] + x0) + (q[1] * (edge[1] + y0) + q[2] * q[2])
             along = edge[0] * p[0] + edge[1] * p[1] + edge[2] * p[2]
-            tension, parameters = sheet.constants[first_tension + family], parameters_of(sheet, family, length)
-            isotropic, axial, by_k, by_tau = derivatives(
-                k, tension, square_difference, square, length, along, *parameters
-            )
+            tension, numbers = sheet.constants[first_tension + family], numbers_of(sheet, family, length)
+            of_spring = ti.static(derivatives(k, tension, square_difference, square, length, along, numbers))
+            isotropic, axial, by_k = of_spring[0], of_spring[1], of_spring[2]
             if ti.static(tense):
                 isotropic += tension
             change = [isotropic * p[c] + axial * edge[c] for c in ti.static(range(3))]
-            by_tau = q[0] * p[0] + q[1] * p[1] + q[2] * p[2] + by_tau * along
-            if ti.static(count > 0):
-                by_lock, by_factor = parameter_derivatives(k, tension, square_difference, square, length, *parameters)
-                return [change[0], change[1], change[2], by_k * along, by_tau, by_lock * along, by_factor * along]
-            else:  # noqa: RET505
-                return [change[0], change[1], change[2], by_k * along, by_tau]
+            by_tau = q[0] * p[0] + q[1] * p[1] + q[2] * p[2] + of_spring[3] * along
+            by_numbers = [of_spring[4][n] * along for n in ti.static(range(by_count))]
+            return change + [by_k * along, by_tau] + by_numbers  # noqa: RUF005  # Taichi nests an unpacked list.
 
         return differentiate
 
@@ -443,8 +444,8 @@ class SpringTerm(Term):
         tense, open_edges, vector, first = self.tense, self.open_edges, config.vector, config.first_measure(SpringTerm)
         varied, curved = self.varied, config.curved
         stiffness_of, tension_of = self.build_stiffness(config), self._build_tension(config)
-        parameters_of, rest_position = self._build_parameters(config), build_point_functions(config).rest_position
-        energy = config.compile_law(self.law, tense=tense).energy
+        numbers_of, rest_position = self._build_numbers(config), build_point_functions(config).rest_position
+        energy = build_spring(self.law, config.operations).energy
         # For each family its index, and the rows down and columns right from one end of a spring to the other.
         structural = ((ALONG_ROW, 0, (1,)), (ALONG_COLUMN, 1, (0,))) if self.structural else ()
         families = structural + (((DIAGONAL, 1, (-1, 1)),) if self.shear else ())
@@ -492,8 +493,7 @@ class SpringTerm(Term):
                             strain = ti.select(exists > 0, strain, vector(0))
                         measures[first + MIN_STRAIN] = ti.min(measures[first + MIN_STRAIN], strain)
                         measures[first + MAX_STRAIN] = ti.max(measures[first + MAX_STRAIN], strain)
-                        parameters = parameters_of(sheet, family, ti.sqrt(square))
-                        stretch = energy(k, tension, strain, *parameters)
+                        stretch = energy(k, tension, strain, numbers_of(sheet, family, ti.sqrt(square)))
                         if ti.static(tense):
                             motion = ti.select(exists > 0, motion, vector(0)) * tension
                         if ti.static(curved):
@@ -507,11 +507,15 @@ class SpringTerm(Term):
         return (measure,)
 
 
+def _steepest(material: Material) -> float:
+    """Return the largest tangent of the springs, relative to that at rest."""
+    return material.stiffening.largest_slope if material.stiffening else 1.0
+
+
 def _unmapped_bound(material: Material) -> float:
     """Return `SpringTerm.stiffness_bound` for factors of 1 [N/m]."""
     across, down, shear = material.across, material.down, material.shear
-    steepest = 1.0 if material.stiffening is None else material.stiffening.factor
-    return steepest * 4 * max(across + down, across + 2 * shear, down + 2 * shear)
+    return _steepest(material) * 4 * max(across + down, across + 2 * shear, down + 2 * shear)
 
 
 def _bounds_of(material: Material, springs: Springs) -> NDArray[Any]:
@@ -520,7 +524,7 @@ def _bounds_of(material: Material, springs: Springs) -> NDArray[Any]:
     for k, (start, end) in zip(springs.stiffness, spring_ends(bounds.shape), strict=True):
         bounds[start] += 2 * k
         bounds[end] += 2 * k
-    return bounds * (1.0 if material.stiffening is None else material.stiffening.factor)
+    return bounds * _steepest(material)
 
 
 Window = tuple[slice, slice]

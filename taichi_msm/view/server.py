@@ -17,13 +17,15 @@ import time
 from collections import deque
 from collections.abc import Callable, Collection, Iterator
 from importlib.resources import files
-from typing import Any
-from urllib.parse import urlsplit
+from typing import Any, cast
 
 import numpy as np
 from PIL import Image
+from tornado.http1connection import HTTP1ServerConnection
 from tornado.httpserver import HTTPServer
 from tornado.httputil import HTTPServerRequest
+from tornado.ioloop import IOLoop
+from tornado.iostream import IOStream
 from tornado.web import Application, HTTPError, RequestHandler
 from tornado.websocket import WebSocketClosedError, WebSocketHandler
 
@@ -31,6 +33,7 @@ from taichi_msm.errors import DeviceError, FilesError, Pause
 from taichi_msm.runs.media import Picture
 from taichi_msm.view import events
 from taichi_msm.view.material import MATERIAL, MAX_FACTOR
+from taichi_msm.view.origin import parse_origin
 from taichi_msm.view.session import Session
 from taichi_msm.view.tools import PositionControlledTool
 
@@ -57,8 +60,20 @@ MAX_UNREAD_PICTURES = 3
 
 MAX_PAGES = 16
 
-# Largest number of events that wait for the next frame.
+# Largest number of open connections, including pages.
+MAX_CONNECTIONS = 64
+
+# Longest duration of a connection that is not a page's [s].
+MAX_REQUEST_S = 10.0
+
+# Largest number of events that wait to be handled.
 MAX_EVENTS = 500
+
+# Number of invalid messages after which a page is disconnected.
+MAX_INVALID_MESSAGES = 20
+
+# Largest number of messages that wait for a page to read; further ones are dropped.
+MAX_UNSENT_MESSAGES = 32
 
 # Shortest wait for events between two pictures [s].
 MIN_WAIT_S = 0.001
@@ -66,8 +81,11 @@ MIN_WAIT_S = 0.001
 # Longest delay behind real time that the session catches up [s].
 MAX_DELAY_S = 0.1
 
-# Longest time of stepping between two pictures, even if more frames are due [s].
+# Longest time of stepping, and of handling events, between two pictures, even if more are due [s].
 MAX_STEPPING_S = 0.03
+
+# Events that save a file.
+SAVES = (events.Key("p"), events.Key("w"))
 
 
 def listen(port: int) -> socket.socket:
@@ -99,14 +117,23 @@ class Server:
         listener: listening socket, from `listen`.
         title: title of the page.
         origins: permitted origins of pages behind a proxy; origins of the loopback interface are always permitted.
+        warn: called with lines for the user.
 
     Attributes:
         url: address of the page, with the token.
         pages: connected pages; the first one steers.
     """
 
-    def __init__(self, session: Session, listener: socket.socket, title: str, origins: Collection[str] = ()) -> None:
-        self._session, self._listener, self._origins, self._title = session, listener, origins, title
+    def __init__(
+        self,
+        session: Session,
+        listener: socket.socket,
+        title: str,
+        origins: Collection[str] = (),
+        warn: Callable[[str], None] = lambda line: None,
+    ) -> None:
+        self._session, self._listener, self._title, self._warn = session, listener, title, warn
+        self._origins = {parse_origin(origin) for origin in origins}
         self._port, self._token = listener.getsockname()[1], secrets.token_urlsafe(24)
         self.url = f"http://{ADDRESS}:{self._port}/{self._token}/"
         self.pages: list[_Connection] = []
@@ -129,12 +156,15 @@ class Server:
             websocket_max_message_size=events.MAX_BYTES,
             websocket_ping_interval=20,
         )
-        http = HTTPServer(application, max_body_size=events.MAX_BYTES)
+        http = _BoundedServer(application, max_body_size=events.MAX_BYTES)
+        http.warn = self._warn
         http.add_socket(self._listener)
         try:
             await self._run(pause)
         finally:
             http.stop()
+            if dropped := sum(event in SAVES for event in self._events):
+                self._warn(f"{dropped} queued saves were dropped")
             for page in self.pages:
                 page.send(json.dumps({"ended": True}))
                 page.close(1001)
@@ -144,20 +174,17 @@ class Server:
     def permits(self, request: HTTPServerRequest) -> bool:
         """Return whether a request has the token, and no origin or a permitted one."""
         token = request.path.lstrip("/").partition("/")[0]
-        origin = request.headers.get("Origin")
-        is_permitted = origin is None or origin in self._origins or self._is_own(origin, request.host)
+        header = request.headers.get("Origin")
+        is_permitted = header is None or self._permits_origin(header, request.host)
         return hmac.compare_digest(token.encode("utf-8", "replace"), self._token.encode()) and is_permitted
 
-    def _is_own(self, origin: str, host: str) -> bool:
-        """Return whether an origin is this server, or a loopback port that `ssh -L` forwards to it."""
-        try:
-            parts, forwarded = urlsplit(origin), urlsplit(f"//{host}").port
-            is_plain = f"{parts.scheme}://{parts.netloc}" == origin and parts.scheme == "http"
-            return (
-                is_plain and parts.hostname in {ADDRESS, "localhost", "::1"} and parts.port in (self._port, forwarded)
-            )
-        except ValueError:
+    def _permits_origin(self, header: str, host: str) -> bool:
+        """Return whether an origin is permitted, this server, or a loopback port that `ssh -L` forwards to it."""
+        origin, forwarded = parse_origin(header), parse_origin(f"http://{host}")
+        if origin is None:
             return False
+        is_loopback = origin.scheme == "http" and origin.host in {ADDRESS, "localhost", "[::1]"}
+        return origin in self._origins or (is_loopback and origin.port in (self._port, forwarded and forwarded.port))
 
     def connect(self, page: _Connection) -> None:
         """Add a page, and send it a description of the session."""
@@ -178,7 +205,9 @@ class Server:
         page.send(json.dumps(description))
 
     def disconnect(self, page: _Connection) -> None:
-        """Remove a page; if it steered, release the tool and let the next page steer."""
+        """Remove a page, if present; if it steered, release the tool and let the next page steer."""
+        if page not in self.pages:
+            return
         if page is self.pages[0]:
             self._events.append(events.Release())
         self.pages.remove(page)
@@ -193,7 +222,11 @@ class Server:
         try:
             event = events.parse_message(message)
         except (ValueError, RecursionError) as error:
-            page.send(json.dumps({"error": str(error)}))
+            page.invalid += 1
+            if page.invalid < MAX_INVALID_MESSAGES:
+                page.send(json.dumps({"error": str(error)}))
+            else:
+                self._reject(page, "too many invalid messages")
             return
         if event is None:
             page.unread = max(0, page.unread - 1)
@@ -201,7 +234,11 @@ class Server:
             if len(self._events) < MAX_EVENTS:
                 self._events.append(event)
             else:
-                page.close(1008, "too many events")
+                self._reject(page, "too many events")
+
+    def _reject(self, page: _Connection, reason: str) -> None:
+        page.close(1008, reason)
+        self.disconnect(page)
 
     async def _run(self, pause: Pause) -> None:
         session = self._session
@@ -209,7 +246,8 @@ class Server:
         while True:
             pause()
             await asyncio.sleep(max(MIN_WAIT_S, pacing.delay_s()) if self.pages else 0.05)
-            while self._events:
+            end = time.perf_counter() + MAX_STEPPING_S
+            while self._events and time.perf_counter() < end:
                 event = self._events.popleft()
                 if event == events.QUIT:
                     return
@@ -240,8 +278,8 @@ class Server:
                 page.readings.append(reading)
 
     def _show(self, pacing: str) -> None:
-        """Send the state, and the picture if it changed, to every page below the limit of unread pictures."""
-        ready = [page for page in self.pages if page.unread < MAX_UNREAD_PICTURES]
+        """Send the state, and the picture if it changed, to every page that reads its pictures."""
+        ready = [page for page in self.pages if page.unread < MAX_UNREAD_PICTURES and page.unsent == 0]
         if not (ready or self._session.filming):
             return
         picture = self._session.bare_picture()
@@ -333,6 +371,45 @@ def encode_jpeg(picture: Picture) -> bytes:
     return file.getvalue()
 
 
+class _BoundedServer(HTTPServer):
+    """HTTP server with at most `MAX_CONNECTIONS`, which closes those without a page after `MAX_REQUEST_S`."""
+
+    # Called with a line when the first connection is refused.
+    warn: Callable[[str], None]
+
+    def __init__(self, *arguments: Any, **options: Any) -> None:
+        super().__init__(*arguments, **options)
+        # All connections, some closed, and the deadlines of those that are not a page's.
+        self._streams: list[IOStream] = []
+        self._deadlines: dict[IOStream, object] = {}
+        self._has_warned = False
+
+    def handle_stream(self, stream: IOStream, address: tuple[Any, ...]) -> None:
+        """Serve a connection, or close it at once."""
+        self._streams = [each for each in self._streams if not each.closed()]
+        if len(self._streams) < MAX_CONNECTIONS:
+            self._streams.append(stream)
+            self._deadlines[stream] = IOLoop.current().call_later(MAX_REQUEST_S, stream.close)
+            super().handle_stream(stream, address)
+            return
+        stream.close()
+        if not self._has_warned:
+            self._has_warned = True
+            limit = f"further ones are refused; those without a page end after {MAX_REQUEST_S:g} s"
+            self.warn(f"{MAX_CONNECTIONS} connections are open, {limit}")
+
+    def on_close(self, server_conn: object) -> None:
+        """Remove the deadline of a connection that has closed or become a page's."""
+        super().on_close(server_conn)
+        IOLoop.current().remove_timeout(self._deadlines.pop(cast(HTTP1ServerConnection, server_conn).stream))
+
+    async def close_all_connections(self) -> None:
+        """Close all connections, also those of pages."""
+        for stream in self._streams:
+            stream.close()
+        await super().close_all_connections()
+
+
 class _Guarded(RequestHandler):
     """Handler that rejects requests without permission."""
 
@@ -368,12 +445,14 @@ class _Connection(_Guarded, WebSocketHandler):
 
     Attributes:
         unread: number of sent pictures that the page has not acknowledged.
+        unsent: number of messages that wait for the page to read.
+        invalid: number of invalid messages of the page.
         readings: time [s], force [N] and depth [m] of each frame since the last picture.
         jpeg: last picture sent to the page.
     """
 
     def open(self) -> None:
-        self.unread = 0
+        self.unread = self.unsent = self.invalid = 0
         self.readings: deque[list[float]] = deque(maxlen=1000)
         self.jpeg = b""
         self.set_nodelay(True)
@@ -387,17 +466,25 @@ class _Connection(_Guarded, WebSocketHandler):
             self.server.receive(self, message)
 
     def on_close(self) -> None:
-        if self in self.server.pages:
-            self.server.disconnect(self)
+        self.server.disconnect(self)
 
     def check_origin(self, origin: str) -> bool:  # noqa: ARG002
         """Permit the origins that `prepare` has checked."""
         return True
 
     def send(self, message: str | bytes) -> None:
-        """Send a message; ignore a page that has left."""
+        """Send a message; ignore a page that has left, or does not read."""
+        if self.unsent >= MAX_UNSENT_MESSAGES:
+            return
         try:
             sent = self.write_message(message, binary=isinstance(message, bytes))
         except WebSocketClosedError:
             return
-        sent.add_done_callback(lambda future: future.cancelled() or future.exception())
+        self.unsent += 1
+        sent.add_done_callback(self._count_sent)
+
+    def _count_sent(self, sent: asyncio.Future[None]) -> None:
+        self.unsent -= 1
+        # Without this call asyncio logs the exception.
+        if not sent.cancelled():
+            sent.exception()

@@ -44,7 +44,7 @@ NOTICE_DURATION_S = 3.0
 def divide_frames(plan: Plan) -> tuple[Plan, int]:
     """Divide every frame of a plan into the largest number of subframes within `MAX_FRAME_RATE`.
 
-    `precision: auto` without a tolerance becomes f32, which takes half the time of f64.
+    In motion, `precision: auto` without a tolerance becomes f32, which takes half the time of f64.
 
     Returns:
         The plan with subframes as its frames, and the number of subframes per frame.
@@ -56,7 +56,7 @@ def divide_frames(plan: Plan) -> tuple[Plan, int]:
         while steps % subframes:
             subframes -= 1
     changes: dict[str, Any] = {"frames_per_second": scene.time.frames_per_second * subframes}
-    if scene.time.precision == "auto" and scene.time.tolerance is None:
+    if scene.time.precision == "auto" and scene.time.tolerance is None and not scene.time.at_rest:
         changes["precision"] = "f32"
     return plan_variant(plan, with_time(scene, **changes)), subframes
 
@@ -455,7 +455,9 @@ class Session:
 
     def _change_material(self, key: str, value: float) -> None:
         """Change a value of the material; later resets keep it."""
-        initial = self._scene_material.get(key, 0.0)
+        if (initial := self._scene_material.get(key)) is None:
+            self.show_notice(f"{key}: missing or 0 in this scene")
+            return
         # The margin allows for rounding.
         if not initial / MAX_FACTOR * 0.999 <= value <= initial * MAX_FACTOR * 1.001:
             self.show_notice(f"{key}: {value:g} is not from {initial / MAX_FACTOR:g} to {initial * MAX_FACTOR:g}")

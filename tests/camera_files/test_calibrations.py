@@ -11,15 +11,16 @@ from typing import Literal
 import cv2
 import numpy as np
 import pytest
+import yaml
 
 from taichi_msm import load_scene
+from taichi_msm.arithmetic import NUMPY
 from taichi_msm.camera_files.calibration import Calibration
 from taichi_msm.camera_files.camera_file import CameraFileError
 from taichi_msm.camera_files.readers import read_calibration
 from taichi_msm.cli.main import main
 from taichi_msm.errors import SceneError
 from taichi_msm.lenses import MODELS
-from taichi_msm.lenses.model import NUMPY
 from taichi_msm.render.camera import view
 from taichi_msm.scene.camera import Camera
 from tests.golden import Messages
@@ -209,6 +210,58 @@ def test_stereo_pair(write: Callable[[], str], unit: Literal["mm"] | None, small
     np.testing.assert_allclose(right.right.translation, TRANSLATION / 1e3, rtol=1e-15)
 
 
+# Further results of stereoCalibrate and stereoRectify, by their names in files. F is no focal length.
+FURTHER: dict[str, object] = {
+    "E": [[0, -0.0002, 0.0001], [0.0002, 0, 0.0797], [-0.0001, -0.0797, 0]],
+    "F": [[0, -6e-10, 1e-6], [6e-10, 0, 2e-4], [-1e-6, -2e7, 1]],
+    **{"R1": np.eye(3).tolist(), "R2": np.eye(3).tolist(), "P1": np.eye(3, 4).tolist(), "P2": np.eye(3, 4).tolist()},
+    **{"Q": np.eye(4).tolist(), "roi1": [0, 0, 40, 30], "roi2": [1, 0, 38, 30], "alpha": 0.5, "map1x": [[0.5]]},
+    **{"rms_error": 0.3, "perViewErrors": [[0.1, 0.2]], "rvecs": [[0, 0, 1]], "tvecs": [[0, 0, 1]], "board": [9, 6]},
+}
+# Patterns of names in public files: matrix and distortion, with {} for the mark of a camera; marks; R; T.
+NAMES = [
+    ("K{}", "D{}", ("1", "2"), "R", "T"),
+    ("CM{}", "D{}", ("1", "2"), "R", "T"),
+    ("intrinsic{}", "distCoeffs{}", ("1", "2"), "R", "T"),
+    ("{}_cameraMatrix", "{}_distCoeffs", ("l", "r"), "R", "T"),
+    ("{}_Camera_Matrix", "{}_Distortion_Coefficients", ("Left", "Right"), "Rotation_Matrix", "Translation_Matrix"),
+    ("camera_matrix_{}", "dist_coeffs_{}", ("left", "right"), "rotation_matrix", "translation_vector"),
+    ("{}_cam_mat", "{}_distort", ("left", "right"), "R", "T"),
+    ("camera_intrinsics_{}", "distortion_coefficients_{}", ("0", "1"), "rotation_matrix", "translation_vector"),
+    ("{}_camera.camera_matrix", "{}_camera.dist_coeffs", ("left", "right"), "stereo.rotation", "stereo.translation"),
+    ("{}_intrinsics.K", "{}_intrinsics.D", ("left", "right"), "extrinsics.R", "extrinsics.T"),
+]
+
+
+@pytest.mark.parametrize("names", NAMES, ids=[names[0] for names in NAMES])
+def test_results_of_stereo_calibrate(names: tuple[str, str, tuple[str, str], str, str], small: Path) -> None:
+    matrix, distortion, marks, rotation, translation = names
+    values: dict[str, object] = {
+        rotation: ROTATION.tolist(),
+        translation: [[t] for t in (TRANSLATION / 1e3).tolist()],
+        **FURTHER,
+    }
+    for mark, camera, coefficients in zip(marks, (MATRIX, RIGHT), (COEFFICIENTS, [0.25, 0, 0, 0]), strict=True):
+        values |= {matrix.format(mark): camera.tolist(), distortion.format(mark): [coefficients]}
+    nested: dict[str, object] = {"image_size": {"width": 40, "height": 30}}
+    for name, value in values.items():
+        section, _, key = name.rpartition(".")
+        part = nested.setdefault(section, {}) if section else nested
+        assert isinstance(part, dict)
+        part[key] = value
+    for text in (json.dumps(nested), yaml.safe_dump(nested)):
+        left, right = read(text), read(text, "right")
+        assert (left.focal, right.focal, left.size) == ((61.5, 60.5), (62.5, 61.5), (40, 30))
+        assert [*left.coefficients.values()] == COEFFICIENTS
+        assert right.right is not None
+        np.testing.assert_array_equal(right.right.rotation, ROTATION)
+        np.testing.assert_allclose(right.right.translation, TRANSLATION / 1e3, rtol=1e-15)
+
+
+def test_fundamental_matrix_of_one_camera(small: Path) -> None:
+    assert read(f"{K}{D}F: [[0, 0, 1], [0, 0, 2], [3, 4, 1]]\n").focal == (61.5, 60.5)
+
+
 def test_stereo_pair_without_unit_or_right_camera(small: Path, message: Messages) -> None:
     with message.raises(CameraFileError, "camera.yml", "calibration_unit"):
         read(stereo("M", "D", "1", "2"), "right")
@@ -260,6 +313,28 @@ def test_ocamcalib(small: Path) -> None:
     assert camera.distortion is not None
     assert camera.distortion.coefficients == tuple(calibration.coefficients.values())
     assert camera.focal_lengths == (1.02 * 120, 1.02 * 120)
+
+
+# C3VD's colonoscope as calib_results.txt.
+C3VD = """\
+#polynomial coefficients
+5 -769.243600037458 0 8.12770624150226e-4 -6.25674244578925e-7 1.19662182144280e-9
+1 0
+542.975887548343 678.544839263292
+1 0 0
+1080 1350
+"""
+
+
+def test_colonoscope_in_the_documentation(small: Path, root: Path) -> None:
+    """The centres of C3VD and of calib_results.txt count from 0."""
+    lines = (root / "docs/cameras.md").read_text(encoding="utf-8").splitlines()
+    start = next(n for n, line in enumerate(lines) if "C3VD's colonoscope" in line)
+    example = yaml.safe_load("\n".join(lines[start : start + 3]))
+    calibration = read(C3VD)
+    np.testing.assert_allclose([*example["intrinsics"].values()], calibration.centre, atol=1e-6)
+    for name in ("a0", "a2", "a3", "a4"):
+        assert example["distortion"][name] == pytest.approx(calibration.coefficients[name], rel=1e-6)
 
 
 # Of the data set, without comments.
@@ -330,6 +405,7 @@ def test_picture_size_and_scale(small: Path, message: Messages) -> None:
 
 K = "K: [61.5, 0, 19.25, 0, 60.5, 14.75, 0, 0, 1]\n"
 D = "D: [-0.3, 0.1, 0.001, -0.002, 0.03]\n"
+HOMOGENEOUS = "K: [FX, 0, 19.25, 0, 0, 60.5, 14.75, 0, 0, 0, 1, 0, 0, 0, 0, 1]\n"
 NORMALISED = "D: [0, 0, 0, 0]\nK: [0.837, 0, 0.5, 0, 1.1, 0.5, 0, 0, 1]\n"
 
 
@@ -356,6 +432,7 @@ NORMALISED = "D: [0, 0, 0, 0]\nK: [0.837, 0, 0.5, 0, 1.1, 0.5, 0, 0, 1]\n"
         pytest.param(K.replace("61.5", "1e9") + D, id="large number"),
         pytest.param(NORMALISED + "image_size: [40, 30]\n", id="normalised focal length"),
         pytest.param(NORMALISED, id="normalised focal length without size"),
+        pytest.param(HOMOGENEOUS.replace("FX", "0.82") + D + "size: [1280, 1024]\n", id="normalised 4 x 4"),
         pytest.param(K + D + "width: 40", id="width alone"),
         pytest.param(K + D + "width: 40\nheight: 30\nimage_size: [80, 60]", id="two sizes"),
         pytest.param(K + "note: 3", id="no distortion"),
@@ -387,6 +464,7 @@ NORMALISED = "D: [0, 0, 0, 0]\nK: [0.837, 0, 0.5, 0, 1.1, 0.5, 0, 0, 1]\n"
         pytest.param("; of two\n[StereoLeft]\nfc_x = 3\n", id="StereoMIS"),
         pytest.param("[StereoLeft]\na = 1\n[StereoRight]\nfc_x = 3\n", id="keys of StereoMIS"),
         pytest.param("[Camera]\nfc_x = 3\n", id="ini file"),
+        pytest.param("[StereoLeft]\nfc_x = 3 ; of the left camera\n# fc_y\nfc_y\n", id="line of an ini file"),
         pytest.param("# Camera list\n1 FOV 40 30 5e2 5e2 3e2 2e2 0.1\n", id="COLMAP"),
         pytest.param("1 PINHOLE 40 30 5e2 5e2 3e2 2e2\n2 PINHOLE 40 30 6e2 5e2 3e2 2e2\n", id="two of COLMAP"),
         pytest.param("1 PINHOLE 40 30 5e2 5e2 3e2\n", id="parameters of COLMAP"),
@@ -398,10 +476,37 @@ def test_invalid_calibration(text: str, small: Path, message: Messages) -> None:
         camera_of("camera.yml")
 
 
+DIGITS = "1" * 5000
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        f"{K}{D}width: 0x{5000 * 'f'}",
+        f"{K}{D}0x{5000 * 'f'}: 1",
+        f"{K}{D}1:{DIGITS}: 1",
+        f'{{"K": {DIGITS}}}',
+        f"1 PINHOLE {DIGITS} 30 60 60 20 15",
+        KALIBR.replace("[61.5", f"[{DIGITS}"),
+    ],
+    ids=["hexadecimal", "hexadecimal key", "key", "JSON", "COLMAP", "Kalibr"],
+)
+def test_numbers_of_thousands_of_digits(text: str, small: Path) -> None:
+    with pytest.raises(CameraFileError, match="camera"):
+        read(text)
+
+
+def test_names_of_thousands_of_digits(small: Path) -> None:
+    cameras = json.dumps(yaml.safe_load(KALIBR)).replace('"cam1"', f'"cam{DIGITS}"')
+    assert read(cameras, "right").focal == (62.5, 61.5)
+    assert read(f"{DIGITS} PINHOLE 40 30 60 60 20 15").size == (40, 30)
+
+
 def test_spellings(small: Path) -> None:
     keys = ("DistCoeff", "distortion_coefs", "dist", "d", "DISTORTION_PARAMETERS", "distortion_vector")
     texts = [f"{K}{key}: [[-0.3, 0.1, 0.001, -0.002, 0.03]]" for key in keys]
     texts += [K.replace("K", key) + D for key in ("mtx", "camera_mtx", "intrinsic_matrix", "cameraMatrix", "M")]
+    texts += [HOMOGENEOUS.replace("FX", "61.5") + D]
     # Twice, equal up to rounding.
     texts += [f"{K}{D}mtx: [61.5, 0, 19.25, 0, 60.50000001, 14.75, 0, 0, 1]\ndist: {[COEFFICIENTS]}"]
     for text in texts:

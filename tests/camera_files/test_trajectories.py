@@ -103,6 +103,14 @@ def test_poses_rate(text: str, small: Path) -> None:
     np.testing.assert_allclose(abs((np.array(rows) * expected)[:, 4:].sum(axis=1)), 1, atol=1e-12)
 
 
+def test_picture_names_of_thousands_of_digits(small: Path) -> None:
+    """The last digits count, or the order of the names."""
+    for prefix in ("1" * 5000, f"{'1' * 5000}.", f"1.{'1' * 5000}a"):
+        Path("poses.txt").write_text(COLMAP.replace("frames/", prefix))
+        rows = read_poses("poses.txt", PoseKeys(poses_rate=5))
+        np.testing.assert_allclose([row[1] for row in rows], [0, 0.1, 0.1], atol=1e-15)
+
+
 def test_gap_in_the_picture_numbers(small: Path) -> None:
     more = COLMAP + "".join(f"9 0 -1 0 0 0 0 0.4 1 frames/{name}.jp2\n20 15 -1\n" for name in ("00110", "00108"))
     Path("poses.txt").write_text(more)

@@ -59,6 +59,19 @@ def contents(out: Path) -> dict[str, bytes]:
     return {name: data for name, data in files(out).items() if name not in ("index.csv", "export.json")}
 
 
+def test_names_that_look_like_formulas(pair: list[str]) -> None:
+    """A spreadsheet takes cells that begin with = + - @ or a tab for formulas."""
+    names = ["=1+2", "-run", "+1", "@run", "\trun", "1=2"]
+    for name in names:
+        shutil.copytree(pair[0], name)
+    export(names, "obj", "all")
+    _, *rows = index(Path("all"))
+    assert not any(cell.startswith(("=", "+", "-", "@", "\t")) for row in rows for cell in row)
+    assert [Path(run) for _, run in rows] == [Path(name) for name in names]
+    assert rows[-1][1] == names[-1]
+    assert export([run for _, run in rows], "obj", "again").files == export(names, "obj", "all").files
+
+
 @pytest.mark.parametrize("name", ["vtk", "gltf", "obj"])
 def test_folder_per_run(name: str, pair: list[str], tmp_path: Path) -> None:
     export(pair, name, "all")

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import click
@@ -13,10 +14,16 @@ from numpy.typing import NDArray
 
 from taichi_msm import SceneError, Simulation, fit, load_scene
 from taichi_msm.cli.fit import parse_window
+from taichi_msm.fitting.least_squares import Misfit, Solution
 from taichi_msm.fitting.machine_curve import CurveRuns, relax
-from taichi_msm.fitting.machine_fit import FittedTest, explanations, unknown_notes
-from taichi_msm.fitting.machine_model import read_machine_problem
-from taichi_msm.machines.loading import Loading, build_loading
+from taichi_msm.fitting.machine_fit import FittedTest, explanations, fitted_tests, unknown_notes
+from taichi_msm.fitting.machine_model import MachineForces, MachineProblem, read_machine_problem
+from taichi_msm.fitting.observation import ErrorCorrelation
+from taichi_msm.fitting.parameters import Parameter
+from taichi_msm.fitting.predict import Prediction
+from taichi_msm.fitting.profiles import Profiler
+from taichi_msm.fitting.uncertainty import uncertainty
+from taichi_msm.machines.loading import Loading, build_loading, find_approach
 from taichi_msm.machines.reader import MachineTest
 from taichi_msm.scene.scene import Scene
 from taichi_msm.system.runtime import Device
@@ -156,6 +163,101 @@ def test_a_contact_at_the_greatest_depth_has_no_curve(pressed: str, message: Mes
         assert runs.predict_coarse(problem.limits[1], 0) is None
         with message.raises(SceneError, "contact"):
             runs.run_curve(problem.limits[1])
+
+
+def test_starts_are_within_bounds(pressed: str) -> None:
+    """Too large shares are scaled down, a share at most to its bound; a trust region has a width."""
+    start = scene(relaxation=[{"share": 0.8, "time": 0.6}, {"share": 0.1, "time": 5.0}])
+    free = [SHARE, SHARE.replace("0", "1"), TIME]
+    bounds = {SHARE: (0.7, 0.9), SHARE.replace("0", "1"): (1e-14, 0.9)}
+    problem = read_machine_problem([pressed], start, free, bounds, None, {"contact": [CONTACT]})
+    low, high = problem.limits
+    with CurveRuns(problem, 1, lambda stage, done, total: None) as runs:
+        assert runs.with_valid_shares(np.zeros(3)).tolist() == [0, 0, 0]
+        valid = runs.with_valid_shares(high)
+        # 0.9 + 0.9 becomes 0.49 + 0.49, then 0.7 + 0.28.
+        shares = [problem.parameters[n].value(valid[n]) for n in range(2)]
+        assert shares == pytest.approx([0.7, 0.28])
+        assert (low <= valid).all()
+        runs._tangent = SimpleNamespace(reach=1e-3)  # type: ignore[assignment]
+        first, last = runs.trust_region(low, np.zeros(3))
+        assert (low <= first).all()
+        assert (first < last).all()
+
+
+class LinearRuns:
+    """Predictions that are linear in x."""
+
+    def __init__(self, problem: Any, slopes: Array) -> None:
+        self.problem, self.slopes, self.count, self.expected = problem, slopes, 0, 0
+
+    def predict_many(self, coordinates: list[Array]) -> list[Prediction]:
+        return [Prediction(((self.slopes @ x)[:, None],), 1, np.zeros(1)) for x in coordinates]
+
+
+def linear_problem(outliers: int = 0) -> tuple[Misfit, LinearRuns]:
+    """Two tests with noise and offsets, a parameter that is a slope of both, and one that is a curvature."""
+    random, time, tests = np.random.default_rng(3), np.linspace(0, 10, 241), []
+    for offset in (0.2, -0.3):
+        force = time + offset + random.normal(0, 0.1, len(time))
+        force[100 : 100 + outliers] += 30
+        tests.append(build_loading(MachineTest("press.csv", time, time, force, 1e-4), RELAXING, is_clamp=True))
+    joined = [np.concatenate([getattr(test, name) for test in tests]) for name in ("time", "force", "sigma")]
+    approach = find_approach(RELAXING)
+    observed = MachineForces("press.csv", joined[0], joined[1][:, None], joined[2], approach, tuple(tests))
+    slopes = np.stack([joined[0], joined[0] ** 2 / 10], axis=1)
+    keys = ("tissue.young", "tissue.stiffening.lock")
+    parameters = tuple(Parameter(key, 1.0, -9.0, 9.0, 1.0) for key in keys)
+    problem = MachineProblem("", RELAXING, parameters, (observed,), tuple(tests), approach)
+    return Misfit([observed], [1.0], robust=outliers > 0), LinearRuns(problem, slopes)
+
+
+def test_uncertainty_of_the_offsets() -> None:
+    """It is that of least squares with one more parameter per test, also in profiles."""
+    misfit, runs = linear_problem()
+    (observed,) = misfit.observations
+    assert isinstance(observed, MachineForces)
+    frames = np.repeat(np.eye(2), len(observed.values) // 2, axis=0)
+    information = np.concatenate([test.information for test in observed.tests])
+    matrix = np.hstack([runs.slopes, frames]) * ((information > 0) / observed.sigma)[:, None]
+    scaled = observed.values[:, 0] / observed.sigma * (information > 0)
+    covariance = np.linalg.inv(matrix.T @ matrix)
+    expected: Array = covariance @ matrix.T @ scaled
+    predicted = runs.predict_many([expected[:2]])[0]
+    cost = misfit.cost(misfit.residuals(predicted, misfit.scales([1.0])))
+    solution = Solution(expected[:2], predicted, misfit.scales([1.0]), cost, converged=True)
+    found = uncertainty(misfit, solution, runs.slopes, ErrorCorrelation(None, None))
+    assert 2 * cost == pytest.approx(np.sum((matrix @ expected - scaled) ** 2))
+    assert found.freedom == round(information.sum()) - 4
+    np.testing.assert_allclose(found.root @ found.root.T, found.factor * covariance[:2, :2], rtol=1e-9)
+    tests = fitted_tests(runs.problem, {}, predicted.values[0], runs.slopes, found)
+    for n, (fitted, given) in enumerate(zip(tests, observed.tests, strict=True)):
+        assert fitted.loading.offset - given.offset == pytest.approx(expected[2 + n])
+        assert fitted.offset_error == pytest.approx(np.sqrt(found.factor * covariance[2 + n, 2 + n]))
+        assert abs(fitted.loading.offset - (0.2, -0.3)[n]) < 4 * fitted.offset_error
+        np.testing.assert_allclose(fitted.loading.force, given.force - expected[2 + n])
+    for n, profile in enumerate(Profiler(runs, misfit, solution, found).profiles()):  # type: ignore[arg-type]
+        half_width = found.quantile * found.deviations[n]
+        # Ends have a relative tolerance of 0.05.
+        assert profile.low == pytest.approx(expected[n] - half_width, abs=0.05 * half_width)
+        assert profile.high == pytest.approx(expected[n] + half_width, abs=0.05 * half_width)
+
+
+def test_offsets_of_a_robust_fit() -> None:
+    """Outliers of a tenth of the frames move the offset by less than a standard deviation of a frame."""
+    misfit, runs = linear_problem(outliers=24)
+    residuals = misfit.residuals(runs.predict_many([np.array([1.0, 0.0])])[0], misfit.scales([1.0]))
+    assert np.sum(np.abs(residuals) > 20) > 15
+    for part in np.split(residuals, 2):
+        assert abs(np.median(part)) < 0.5
+
+
+def test_note_about_an_estimated_contact(pressed: str) -> None:
+    """A late contact makes the tissue too stiff; a given one has no note."""
+    for contact in (None, [CONTACT]):
+        result = estimate(RELAXING, pressed, [YOUNG], rate=RATE, contact=contact)
+        notes = [note for note in result.notes if "found from the noise" in note]
+        assert len(notes) == (contact is None)
 
 
 def test_rejection_of_a_contact_found_in_a_slack(device: Device, tmp_path: Path, message: Messages) -> None:

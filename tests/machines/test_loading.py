@@ -91,6 +91,46 @@ def test_noise_of_the_first_rows() -> None:
     assert build_loading(table(TIME, TIME, RAMP, 0.02), scene()).noise == 0.02
 
 
+@pytest.mark.parametrize("pulled_from", [0.0, 5.0])
+@pytest.mark.parametrize("repeated", [1, 2])
+def test_standard_deviation_of_frames(pulled_from: float, repeated: int) -> None:
+    """That of the means of their rows, also of a ramp from the first row, and where the sensor repeats its values."""
+    noise = 0.01 * np.random.default_rng(0).normal(size=len(TIME)).repeat(repeated)[: len(TIME)]
+    ramp = np.maximum(TIME - pulled_from, 0)
+    loading = build_loading(table(TIME, ramp, ramp**2 + noise, 1e-6), RELAXING, is_clamp=True)
+    # Frames of 11 rows, two of which are shared, and of half of them at the ends.
+    assert loading.information.tolist() == pytest.approx([5.5 / 6 if pulled_from else 0, *[10 / 11] * 99, 5.5 / 6])
+    # 333 means of three rows have 333 / 2.63 degrees of freedom: 6 %; three standard deviations.
+    assert loading.sigma_freedom == pytest.approx(333 / 2.63, rel=0.02)
+    assert loading.sigma[1] == pytest.approx(0.01 * np.sqrt(repeated / 10), rel=0.19)
+    np.testing.assert_allclose(loading.sigma[1:-1], loading.sigma[1])
+    np.testing.assert_allclose(loading.sigma[-1], loading.sigma[1] * np.sqrt(10 / 5.5))
+
+
+def test_frames_between_rows_have_no_information() -> None:
+    """Rows at 0, 0.25, 0.5, ... s; half of them are on the border of two frames."""
+    time = np.arange(0, 12.6, 0.25)
+    loading = build_loading(table(time, time, np.maximum(time - 6, 0), 1e-3), RELAXING, rate=10)
+    expected = np.tile([1, 0, 0.5, 0.5, 0], 26)[: len(loading.force)]
+    np.testing.assert_allclose(loading.information, expected)
+    assert loading.information.sum() == len(time)
+    # The corner of the ramp is no error: the digit remains.
+    np.testing.assert_allclose(loading.sigma[0], 1e-3 / np.sqrt(12))
+
+
+def test_first_rows_belong_to_the_first_frame_without_force() -> None:
+    """Their median is 0, with the variance of the mean of 2 n / pi rows."""
+    random = np.random.default_rng(2)
+    force = np.maximum(TIME - 9, 0) + random.normal(0, 0.01, len(TIME))
+    loading = build_loading(table(TIME, TIME, force, 1e-6), scene(), contact=9.0)
+    rows, spacing = 2 / np.pi * 51, 1.05 / DEPTH_FRAMES
+    near = np.abs(TIME - 8.95) <= spacing / 2 * (1 + 1e-6)
+    expected = (force[near] - np.median(force[:51])).sum() / (near.sum() + rows)
+    assert loading.force[0] == pytest.approx(expected)
+    row = loading.sigma[loading.information == 1].max()
+    assert loading.sigma[0] == pytest.approx(row / np.sqrt(near.sum() + rows))
+
+
 def test_contact_is_the_last_row_without_a_force_before_the_peak() -> None:
     force = RAMP.copy()
     force[200] = 3.0  # A knock before the contact.

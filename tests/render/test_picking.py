@@ -69,6 +69,13 @@ def test_no_rest_plane_above_the_horizon() -> None:
     assert [intersect_rest_plane(camera, (48, row)) is None for row in (10, 39.5, 70)] == [True, True, False]
 
 
+def test_no_rest_plane_outside_the_image_of_a_lens() -> None:
+    # The distorted radius r - 0.5 r^3 is at most 0.54 focal lengths, 32 pixels.
+    lens = {"intrinsics": {"fx": 60, "fy": 60, "cx": 48, "cy": 40}, "distortion": {"k1": -0.5}}
+    camera = view(sheet({"eye": [0, 0, 0.5], "target": [0, 0, 0], "up": [0, 1, 0], "outside": "background", **lens}))
+    assert [intersect_rest_plane(camera, (x, 40)) is None for x in (48, 78, 82, 1e12)] == [False, False, True, True]
+
+
 def test_orbit_keeps_target_and_distance() -> None:
     camera = pinhole(sheet("oblique"))
     eye = extrinsics(camera, 0).eye

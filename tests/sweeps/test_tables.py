@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import csv
 import itertools
 import json
 import shutil
@@ -21,6 +22,7 @@ from scipy.stats import qmc
 
 from taichi_msm import sweep
 from taichi_msm.errors import ForeignError
+from taichi_msm.load.scene_file import parse_override
 from taichi_msm.plot_style import STYLE
 from taichi_msm.sweeps import plots
 from taichi_msm.sweeps.plots import (
@@ -323,6 +325,22 @@ def test_data_set_of_several_sizes(small: Path, pool: Pool) -> None:
     assert {path.name for path in Path("out").iterdir()} == {
         *("runs", "sweep.json", "table.csv", "table.parquet", "dataset.json", "contact.jpg"),
     }
+
+
+def test_cells_that_look_like_formulas(make: Make) -> None:
+    """A spreadsheet takes cells that begin with = + - @ for formulas; those of values are still arguments of --set."""
+    pictures = ["=1+2.png", "-a.png", "+a.png", "@a.png"]
+    for name in pictures:
+        shutil.copy("speckle.png", name)
+    state = make(vary={**VARY, "image": {"choice": pictures}, "probes.0.offset": {"choice": [-1.5]}})
+    state.outcomes[0] = Outcome(0, "refused", "--set probes.0.offset=-1.5: why")
+    write(state)
+    rows = list(csv.DictReader((state.directory / "table.csv").read_text().splitlines()))
+    for row, values in zip(rows, state.values, strict=True):
+        assert not row["image"].startswith(("=", "+", "-", "@"))
+        assert [parse_override(f"key={row[key]}").value for key in state.sweep.keys] == values
+        assert row["probes.0.offset"] == "-1.5", "a number stays one"
+    assert rows[0]["error"] == "'--set probes.0.offset=-1.5: why"
 
 
 def test_summary_lines(message: Messages) -> None:

@@ -17,6 +17,7 @@ from taichi_msm import Simulation, run
 from taichi_msm.arithmetic import NUMPY
 from taichi_msm.errors import SceneError
 from taichi_msm.gradients.gradient import Adjoint, gradient
+from taichi_msm.laws.locking import Locking
 from taichi_msm.load.check import check_scene
 from taichi_msm.model.loads import evaluate_frame_loads
 from taichi_msm.model.sheet import rest_positions
@@ -24,7 +25,7 @@ from taichi_msm.scene.scene import Scene
 from taichi_msm.solver.planning import make_plan
 from taichi_msm.system.runtime import Device
 from taichi_msm.terms.elasticity import energy_density
-from taichi_msm.terms.law import LockingLaw, build_locking
+from taichi_msm.terms.law import build_law, build_spring
 from tests import reference
 from tests.conftest import Program
 from tests.golden import Messages
@@ -62,35 +63,45 @@ def made(case: str, **sections: Any) -> Scene:
 
 @pytest.mark.parametrize("factor", [1.5, 10.0, 1000.0])
 def test_law_integral_and_tangent(factor: float) -> None:
-    law, end = build_locking(NUMPY), 1 - factor**-0.5
+    law, shape = build_law(Locking(), NUMPY), list(Locking().shape(factor))
+    (end,) = shape
     for x in (-0.3, 1e-3, 0.05, 0.2, 0.5, 0.9, 1.5):
-        assert x * law.secant(x, end) == pytest.approx(float(lock(np.array(x), 1.0, factor)), rel=1e-14)
+        assert x * law.secant(x, shape) == pytest.approx(float(lock(np.array(x), 1.0, factor)), rel=1e-14)
         integral, _ = quad(lambda e: float(lock(np.array(e), 1.0, factor)), 0, x, points=[min(end, max(x, 0))])
-        assert law.energy(x, end) == pytest.approx(2 * integral, rel=1e-9)
+        assert law.integral(x, *shape) == pytest.approx(2 * integral, rel=1e-9)
         slope = (lock(np.array(x + 1e-7), 1.0, factor) - lock(np.array(x - 1e-7), 1.0, factor)) / 2e-7
-        assert law.tangent(x, end) == pytest.approx(float(slope), rel=1e-5)
+        assert law.tangent(x, shape) == pytest.approx(float(slope), rel=1e-5)
+        assert law.tangent(x, shape) == pytest.approx((1 - min(max(x, 0), end)) ** -2, rel=1e-12)
 
 
 def test_digits_of_small_energies() -> None:
-    law = build_locking(NUMPY)
+    law = build_law(Locking(), NUMPY)
     x = np.float32(10) ** np.arange(-6, 0, dtype=np.float32)
     exact = 2 * (-x.astype(np.longdouble) - np.log1p(-x.astype(np.longdouble)))
-    np.testing.assert_allclose(law.energy(x, np.float32(0.99)), exact.astype(float), rtol=2e-6)
+    np.testing.assert_allclose(law.integral(x, np.float32(0.99)), exact.astype(float), rtol=2e-6)
 
 
-def test_derivatives_of_a_spring() -> None:
-    law, numbers, length = LockingLaw().build(NUMPY), (1 / (0.1 * 2.0), 0.6, 0.1), 2.0
+@pytest.mark.parametrize("law", [None, Locking()])
+def test_derivatives_of_a_spring(law: Locking | None) -> None:
+    spring, length = build_spring(law, NUMPY), 2.0
     edge, h = np.array([1.7, 0.9, 1.0]), 1e-6
+    values: tuple[float, ...] = (0.1, 0.6) if law else ()
 
-    def force(edge: NDArray[Any], k: float = 3.0, tau: float = 0.4) -> NDArray[Any]:
+    def force(edge: NDArray[Any], k: float = 3.0, tau: float = 0.4, values: tuple[float, ...] = values) -> NDArray[Any]:
         square = float(edge @ edge)
-        return np.asarray(law.pull(k, tau, square - length**2, square, length, *numbers) * edge)
+        numbers = [1 / (values[0] * length), *values] if law else []
+        return np.asarray(spring.pull(k, tau, square - length**2, square, length, numbers) * edge)
 
     p, square = np.array([0.3, -0.2, 0.5]), float(edge @ edge)
-    s, w, by_k, by_tau = law.derivatives(3.0, 0.4, square - length**2, square, length, edge @ p, *numbers)
+    numbers = [1 / (values[0] * length), *values] if law else []
+    s, w, by_k, by_tau, by_numbers = spring.derivatives(3.0, 0.4, square - length**2, square, length, edge @ p, numbers)
     np.testing.assert_allclose(s * p + w * edge, (force(edge + h * p) - force(edge - h * p)) / (2 * h), rtol=1e-8)
     np.testing.assert_allclose(by_k * edge, force(edge, k=4.0) - force(edge), rtol=1e-12)
-    np.testing.assert_allclose(by_tau * edge, force(edge, tau=1.4) - force(edge), rtol=1e-12)
+    np.testing.assert_allclose(by_tau * edge, force(edge, tau=1.4) - force(edge), rtol=1e-12, atol=1e-12)
+    for n, by in enumerate(by_numbers):
+        less, more = (tuple(value * (1 + sign * h * (m == n)) for m, value in enumerate(values)) for sign in (-1, 1))
+        change = (force(edge, values=more) - force(edge, values=less)) / (2 * h)
+        np.testing.assert_allclose(by * edge, change if n == 0 else change / values[n], rtol=1e-7)
 
 
 @pytest.mark.parametrize(("case", "fixed"), [(case, "border") for case in CASES] + [("sheet", ["left"])])

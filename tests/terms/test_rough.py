@@ -20,7 +20,6 @@ from taichi_msm.scene.tools import Probe
 from taichi_msm.solver.rest import FORCE_TOLERANCE, QuasiStatics
 from taichi_msm.solver.state import RunProgress
 from taichi_msm.system.runtime import Device
-from taichi_msm.terms.law import make_stiffening
 from tests.golden import Messages
 from tests.reference.rough import rough_frames
 from tests.scenes import plan_of
@@ -75,8 +74,6 @@ def test_stiffening_and_relaxation(device: Device) -> None:
     """The force on each stuck mass point depends on its own history, so the sum relaxes like each of them."""
     lock, branches = 9e-3, [{"share": 0.6, "time": 0.3}, {"share": 0.2, "time": 4.0}]
     foundation = {"young": MODULUS * 0.015, "depth": 0.015, "lock": lock, "factor": 10}
-    law = make_stiffening(lock, 10.0)
-    assert law is not None
     tissue = {**ALONE, "foundation": foundation, "relaxation": branches, "stiffening": {"lock": 0.5}}
     forces = forces_of(indented(RADIUS, 4, tissue), device)[:, 2]
     r = (np.arange(2000) + 0.5) / 2000 * RADIUS

@@ -7,13 +7,16 @@ import json
 import logging
 import re
 import signal
-from collections.abc import AsyncIterator, Callable, Coroutine, Iterator
+import socket
+from collections.abc import AsyncIterator, Callable, Coroutine, Iterator, Sequence
 from contextlib import ExitStack, asynccontextmanager, suppress
 from functools import partial, wraps
 from io import BytesIO
+from itertools import product
 from pathlib import Path
 from time import monotonic
-from typing import Any, ClassVar
+from typing import Any, ClassVar, get_args
+from urllib.parse import urlsplit
 
 import numpy as np
 import pytest
@@ -24,11 +27,21 @@ from tornado.websocket import WebSocketClientConnection, WebSocketClosedError, w
 from taichi_msm import load_scene
 from taichi_msm.cli.main import main
 from taichi_msm.errors import Pause
+from taichi_msm.runs.media import Picture
 from taichi_msm.system.runtime import Device
 from taichi_msm.view import server as server_module
-from taichi_msm.view.events import MAX_BYTES, parse_message
+from taichi_msm.view.events import KEYS, MAX_BYTES, Event, parse_message
+from taichi_msm.view.material import MATERIAL
 from taichi_msm.view.recording import Captures
-from taichi_msm.view.server import MAX_PAGES, MAX_UNREAD_PICTURES, PAGE, Server, listen
+from taichi_msm.view.server import (
+    MAX_INVALID_MESSAGES,
+    MAX_PAGES,
+    MAX_UNREAD_PICTURES,
+    MAX_UNSENT_MESSAGES,
+    PAGE,
+    Server,
+    listen,
+)
 from taichi_msm.view.session import Session
 from tests.conftest import Program
 from tests.golden import Messages
@@ -47,8 +60,10 @@ def session(small: Path, device: Device) -> Iterator[Session]:
 
 
 @asynccontextmanager
-async def served(session: Session, *origins: str) -> AsyncIterator[Server]:
-    server = Server(session, listen(0), "small.yaml", origins)
+async def served(
+    session: Session, *origins: str, warn: Callable[[str], None] = lambda line: None
+) -> AsyncIterator[Server]:
+    server = Server(session, listen(0), "small.yaml", origins, warn)
     running = asyncio.create_task(server.run(lambda: None))
     try:
         yield server
@@ -86,9 +101,9 @@ class Client:
         state: dict[str, Any] = json.loads(message[4 : 4 + length])
         return state
 
-    async def until(self, met: Callable[[dict[str, Any]], bool]) -> dict[str, Any]:
-        """Read until a state meets a condition, for at most WAIT_S."""
-        deadline = monotonic() + WAIT_S
+    async def until(self, met: Callable[[dict[str, Any]], bool], seconds: float = WAIT_S) -> dict[str, Any]:
+        """Read until a state meets a condition, for a limited time."""
+        deadline = monotonic() + seconds
         while monotonic() < deadline:
             if (state := await self.read()) and met(state):
                 return state
@@ -125,8 +140,11 @@ def run(scenario: Coroutine[Any, Any, None]) -> None:
             while Client.opened:
                 connection = Client.opened.pop()
                 connection.close()
-                while connection.close_code is None and await connection.read_message() is not None:
-                    pass
+                # The end of a connection is read only once, by the scenario or here.
+                with suppress(TimeoutError):
+                    while connection.close_code is None:
+                        if await asyncio.wait_for(connection.read_message(), WAIT_S) is None:
+                            break
 
     asyncio.run(with_clients())
 
@@ -143,7 +161,7 @@ def scenario(test: Callable[..., Coroutine[Any, Any, None]]) -> Callable[..., No
 
 @scenario
 async def test_requests_need_the_token_and_a_known_origin(session: Session) -> None:
-    async with served(session, "https://hub.example.org") as server:
+    async with served(session, "https://Hub.example.org:443/") as server:
         root, _, token = server.url.rstrip("/").rpartition("/")
         assert len(token) >= 32
         port = root.rpartition(":")[2]
@@ -254,7 +272,9 @@ def test_faults_of_messages(text: str, message: Messages) -> None:
 
 
 @scenario
-async def test_malformed_messages_and_floods_are_refused(session: Session, monkeypatch: pytest.MonkeyPatch) -> None:
+async def test_malformed_messages_and_floods_are_refused(
+    session: Session, monkeypatch: pytest.MonkeyPatch, message: Messages
+) -> None:
     async with served(session) as server:
         client = await connect(server)
         messages: list[str | bytes] = [*MALFORMED, b"\xff\xfe\x00"]
@@ -263,6 +283,12 @@ async def test_malformed_messages_and_floods_are_refused(session: Session, monke
         while len(client.texts) < 1 + len(messages):
             await client.read()
         assert all("error" in text for text in client.texts[1:])
+        for _ in range(MAX_INVALID_MESSAGES - len(messages)):
+            client.connection.write_message("x")
+        with pytest.raises(AssertionError, match="closed: 1008"):
+            await client.until(lambda state: False)
+        message(client.connection.close_reason or "")
+        client = await connect(server)
         await client.connection.write_message("[" + " " * MAX_BYTES + "]")
         with pytest.raises(AssertionError, match="closed: 1009"):
             await client.until(lambda state: False)
@@ -276,6 +302,141 @@ async def test_malformed_messages_and_floods_are_refused(session: Session, monke
         with pytest.raises(AssertionError, match="closed: 1013"):
             await crowd[-1].read()
         assert await crowd[0].until(lambda state: state["steers"])
+
+
+# Arguments of events: of other types, out of range, and of other events.
+ODD: list[Any] = [0, -60.5, 1e12, -1e12, 1e-300, 1e13, float("nan"), True, None, "x", [], {"x": 1}]
+EVENTS = [kind.__name__.lower() for kind in get_args(Event)]
+
+
+def odd_messages() -> list[str | bytes]:
+    """Messages with valid and invalid names of events, and up to three arguments; none quits."""
+    arguments = [(), *product(ODD, repeat=1), *product(ODD, repeat=2), *((60, 50, pull) for pull in ODD)]
+    lists = [[name, *values] for name in EVENTS for values in arguments]
+    lists += [["material", key, value] for key in MATERIAL for value in (*ODD, 15, 25)]
+    lists += [[name, key] for name in EVENTS for key in (*KEYS, *MATERIAL) if key != "q"]
+    texts: list[str | bytes] = [json.dumps(values) for values in lists]
+    return [*texts, *(text.encode() for text in texts[::40] if isinstance(text, str)), *MALFORMED, b"\xff\xfe\x00", b""]
+
+
+@scenario
+async def test_no_message_ends_the_session(
+    session: Session, monkeypatch: pytest.MonkeyPatch, message: Messages
+) -> None:
+    messages = odd_messages()
+    monkeypatch.setattr(server_module, "MAX_INVALID_MESSAGES", len(messages))
+    monkeypatch.setattr(server_module, "MAX_EVENTS", len(messages))
+    async with served(session) as server:
+        client = await connect(server)
+        await client.until(lambda state: True)
+        page, count = server.pages[0], 0
+        for text in messages:
+            client.connection.write_message(text, binary=isinstance(text, bytes))
+            count += 1
+            if count % 100 == 0:
+                await client.read()
+        await client.until(lambda state: state["handled"] + page.invalid == count, 120)
+        assert 0.5 * count < page.invalid < count
+        await client.send("material", "tissue.young", 0)
+        message((await client.until(partial(shows, "tissue.young: missing or 0")))["notice"])
+
+
+async def end(reader: asyncio.StreamReader) -> None:
+    """Read until the server closes the connection."""
+    with suppress(ConnectionError):
+        while await asyncio.wait_for(reader.read(10_000), WAIT_S):
+            pass
+
+
+# Beginnings of requests: nothing, parts of the header and of two bodies, and a finished one on a connection kept alive.
+HOST = b" / HTTP/1.1\r\nHost: a\r\n"
+UNFINISHED = [
+    *(b"", b"GET /", b"GET" + HOST, b"POST" + HOST + b"Content-Length: 400\r\n\r\na"),
+    *(b"POST" + HOST + b"Transfer-Encoding: chunked\r\n\r\n5\r\nab", b"GET" + HOST + b"\r\n"),
+]
+
+
+@scenario
+async def test_connections_are_bounded_in_number_and_time(
+    session: Session, monkeypatch: pytest.MonkeyPatch, message: Messages
+) -> None:
+    async def begin(texts: Sequence[bytes]) -> list[asyncio.StreamWriter]:
+        """Open connections with texts; `ends` has a task for the end of each."""
+        opened = [await asyncio.open_connection(url.hostname, url.port) for _ in texts]
+        ends.extend(asyncio.create_task(end(reader)) for reader, _ in opened)
+        for (_, writer), text in zip(opened, texts, strict=True):
+            writer.write(text)
+        return [writer for _, writer in opened]
+
+    lines: list[str] = []
+    ends: list[asyncio.Task[None]] = []
+    async with served(session, warn=lines.append) as server:
+        url = urlsplit(server.url)
+        monkeypatch.setattr(server_module, "MAX_REQUEST_S", 2.0)
+        page, opened = await connect(server), monotonic()
+        monkeypatch.setattr(server_module, "MAX_REQUEST_S", WAIT_S)
+        monkeypatch.setattr(server_module, "MAX_CONNECTIONS", 1 + len(UNFINISHED))
+        writers = await begin(2 * UNFINISHED)
+        await asyncio.wait_for(asyncio.gather(*ends[len(UNFINISHED) :]), WAIT_S)
+        await page.until(lambda state: True)
+        assert not any(task.done() for task in ends[: len(UNFINISHED)])
+        monkeypatch.setattr(server_module, "MAX_CONNECTIONS", 64)
+        monkeypatch.setattr(server_module, "MAX_REQUEST_S", 0.3)
+        ends.clear()
+        slow = await begin(UNFINISHED)
+        deadline = monotonic() + WAIT_S
+        while not all(task.done() for task in ends):
+            # The header and the body continue slowly.
+            for task, writer in list(zip(ends, slow, strict=True))[2:4]:
+                if not task.done():
+                    writer.write(b"a")
+            await page.read()
+            assert monotonic() < deadline
+        monkeypatch.setattr(server_module, "MAX_REQUEST_S", WAIT_S)
+        assert await status(server.url) == 200
+        while monotonic() < opened + 2.5:
+            await page.read()
+        await page.send("key", "m")
+        await page.until(lambda state: state["handled"] == 1)
+        for writer in (*writers, *slow):
+            writer.close()
+    message(lines, f"{1 + len(UNFINISHED)} connections", hide=r"\d+(?= s$)")
+
+
+@scenario
+async def test_page_that_does_not_read_gets_no_more_messages(session: Session, monkeypatch: pytest.MonkeyPatch) -> None:
+    async with served(session) as server:
+        with socket.socket() as silent:
+            # Small buffers of the kernel, at both ends.
+            silent.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 2048)
+            silent.setblocking(False)
+            url = urlsplit(server.url)
+            await asyncio.get_running_loop().sock_connect(silent, (url.hostname, url.port))
+            silent.send(
+                f"GET {url.path}socket HTTP/1.1\r\nHost: {url.netloc}\r\nUpgrade: websocket\r\nConnection: Upgrade\r\n"
+                "Sec-WebSocket-Key: dGhlIHNhbXBsZSBub25jZQ==\r\nSec-WebSocket-Version: 13\r\n\r\n".encode()
+            )
+            while not server.pages:
+                await asyncio.sleep(0.01)
+            page, write, sizes = server.pages[0], server.pages[0].write_message, []
+            assert page.ws_connection is not None
+            assert page.ws_connection.stream is not None
+            page.ws_connection.stream.socket.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, 2048)
+
+            def write_message(message: str | bytes, binary: bool) -> Any:
+                sizes.append(len(message))
+                return write(message, binary)
+
+            monkeypatch.setattr(page, "write_message", write_message)
+            watching = await connect(server)
+            # Acknowledgements of pictures that were not read, and events with a notice; unmasked texts are permitted.
+            for _ in range(50):
+                for text in (b'["shown"]', b'["key", "f"]'):
+                    silent.send(b"\x81" + bytes([len(text)]) + text)
+                await watching.until(lambda state: True)
+            # A notice has 35 bytes. The buffers of the kernel hold few states and pictures.
+            assert sum(size > 100 for size in sizes) < 10
+            assert len(sizes) < 10 + MAX_UNSENT_MESSAGES
 
 
 @scenario
@@ -317,6 +478,42 @@ def test_interruption_reaches_the_pages_and_saves_the_film(session: Session) -> 
     session.close()
     assert Path("live.mp4").stat().st_size > 1000
     assert [path.name for path in Path().glob(".*")] == []
+
+
+def test_interruption_drops_queued_saves(session: Session, message: Messages, monkeypatch: pytest.MonkeyPatch) -> None:
+    count, interrupted = 400, asyncio.Event()
+    lines: list[str] = []
+    save = Captures.save_picture
+
+    def save_picture(captures: Captures, picture: Picture) -> Path:
+        interrupted.set()
+        return save(captures, picture)
+
+    def pause() -> None:
+        if interrupted.is_set():
+            raise KeyboardInterrupt
+
+    async def steps() -> None:
+        server = Server(session, listen(0), "small.yaml", warn=lines.append)
+        running = asyncio.create_task(server.run(pause))
+        client = await connect(server)
+        await client.until(lambda state: True)
+        monkeypatch.setattr(Captures, "save_picture", save_picture)
+        for _ in range(count):
+            server.receive(server.pages[0], '["key", "p"]')
+        while {"ended": True} not in client.texts:
+            await client.read()
+        await running
+
+    with pytest.raises(KeyboardInterrupt):
+        run(steps())
+    pictures = list(Path("captures").iterdir())
+    for path in pictures:
+        with Image.open(path) as picture:
+            assert picture.size == (120, 100)
+    (line,) = lines
+    assert line.startswith(f"{count - len(pictures)} ")
+    message(line, hide=r"\d+")
 
 
 @scenario

@@ -450,6 +450,7 @@ def test_divergence_is_reported_and_reset(begin: Begin, message: Messages) -> No
         ({"frames_per_second": 24, "precision": "f64"}, 2, "f64"),
         # 25 steps per frame are divisible by neither 3 nor 2.
         ({"frames_per_second": 20, "step": 0.002}, 1, "f32"),
+        ({"frames_per_second": 25, "motion": "quasistatic"}, 2, "f64"),
     ],
 )
 def test_subframes_of_a_session(time: dict[str, Any], count: int, precision: str, small: Path) -> None:

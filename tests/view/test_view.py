@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 import signal
 from itertools import islice
 from pathlib import Path
@@ -54,6 +55,9 @@ def test_film_of_a_script(small: Path, program: Program, message: Messages) -> N
         "--script a.yaml",
         "--port 8000 --record a.gif --seconds 1",
         "--browser --origin hub.example.org",
+        "--origin https://me@hub.example.org/user",
+        "--origin 'http://a b'",
+        "--origin http://[::1",
         "--record a.png --seconds 1",
         "--record a.gif --seconds 0",
         "--record a.gif --seconds nan",
@@ -64,7 +68,7 @@ def test_film_of_a_script(small: Path, program: Program, message: Messages) -> N
 def test_invalid_arguments_of_view(
     arguments: str, small: Path, capsys: pytest.CaptureFixture[str], message: Messages
 ) -> None:
-    assert main(["view", "small.yaml", *arguments.split()]) == 2
+    assert main(["view", "small.yaml", *shlex.split(arguments)]) == 2
     output = capsys.readouterr()
     assert output.out == ""
     # click's message of a range depends on its version.
