@@ -31,7 +31,6 @@ REFINE = 10
 # The baseline.
 HEADLIGHT = "headlight"
 
-INSTRUMENTED = "tissue, instrument"
 LABELS = "labels alone"
 
 # Pinholes without and with a lens, at a height [m] from which the sheet fills either picture.
@@ -84,11 +83,11 @@ def variants(problem: Problem) -> dict[str, Callable[[], Any]]:
         "none": picture(scene("none")),
         "tissue": picture(tissue),
         "tissue, relief": picture(scene("tissue", light={"relief": -0.2})),
-        INSTRUMENTED: picture(with_instrument(tissue)),
+        "tissue, instrument": picture(with_instrument(tissue)),
         "headlight and labels": picture(plain, labels=True),
         LABELS: picture(plain, picture=False, labels=True),
         "flow and occlusion": lambda: compute_flow(plain, coordinates, problem.rest, camera),
-        **{f"{INSTRUMENTED}, {name}": picture(made) for name, made in pinholes.items()},
+        **{f"tissue, instrument, {name}": picture(made) for name, made in pinholes.items()},
         **{f"{LABELS}, {name}": picture(made, picture=False, labels=True) for name, made in pinholes.items()},
     }
 

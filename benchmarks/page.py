@@ -11,7 +11,7 @@ from typing import Any
 from benchmarks import bounds, gradients, looks, native, terms, whole_run
 from benchmarks.drawing.measure import WANTED
 from benchmarks.marked import table
-from benchmarks.parts import NARROW, READY, REFINE
+from benchmarks.parts import NARROW, REFINE
 from benchmarks.process import ROOT
 from benchmarks.stepping.measure import TOLERANCE
 from taichi_msm import load_scene
@@ -70,24 +70,17 @@ def tables(results: Results) -> dict[str, str]:
     """Return the tables of the page; those of missing parts are `NOT_MEASURED`."""
     makers: dict[str, tuple[str, Callable[[], str]]] = {
         "stepping_table": ("stepping", lambda: stepping_table(results["stepping"])),
-        "ratio_table": ("stepping", lambda: ratio_table(results["stepping"])),
-        "narrow_step_table": ("narrow", lambda: narrow_step_table(results["narrow"])),
-        "narrow_picture_table": ("narrow", lambda: narrow_picture_table(results["narrow"])),
-        "remap_ratios": ("drawing", lambda: remap_ratios(results["drawing"])),
-        "lit_table": ("drawing", lambda: drawing_table(results["drawing"]["lit"])),
-        "flat_table": ("drawing", lambda: drawing_table(results["drawing"]["flat"])),
+        "narrow_table": ("narrow", lambda: narrow_table(results["narrow"])),
+        "drawing_table": ("drawing", lambda: drawing_table(results["drawing"])),
         "whole_run_table": ("whole_run", lambda: whole_run_table(results["whole_run"])),
         "terms_table": ("terms", lambda: relative_table("a step", results["terms"], terms.SPRINGS)),
         "gradient_table": ("gradient", lambda: gradient_table(results["gradient"])),
         "looks_table": ("looks", lambda: relative_table("a picture", pictures(results), looks.HEADLIGHT)),
-        "lens_ratios": ("looks", lambda: lens_ratios(results["looks"]["pictures"])),
-        "rates_table": ("looks", lambda: rates_table(results["looks"]["rates"])),
+        "rates": ("looks", lambda: rates(results["looks"]["rates"])),
         "compilers_table": ("compilers", lambda: compilers_table(results["compilers"])),
-        "size_table": ("size", lambda: size_table(results["size"])),
         "threads_table": ("threads", lambda: threads_table(results["threads"])),
-        "machine_table": ("bounds", lambda: machine_table(results["bounds"])),
-        "step_bound_table": ("bounds", lambda: step_bound_table(results)),
-        "drawing_bound_table": ("bounds", lambda: drawing_bound_table(results)),
+        "machine_rates": ("bounds", lambda: machine_rates(results["bounds"])),
+        "bound_table": ("bounds", lambda: bound_table(results)),
     }
     texts = {name: make() if part in results else NOT_MEASURED for name, (part, make) in makers.items()}
     wide = f"{results['machine']['cpu']}, {results['machine']['vectors']} bits"
@@ -116,17 +109,7 @@ def page(results: Results) -> str:
         pixel_flops=bounds.PIXEL_FLOPS,
         frame_steps=make_plan(load_scene(ROOT / whole_run.SCENE)).grid.steps_per_frame,
         launch_share=launch_share(results),
-        warm_shares=warm_shares(results),
     )
-
-
-def warm_shares(results: Results) -> str:
-    """Format the share of each stage in a warm run."""
-    if "whole_run" not in results:
-        return NOT_MEASURED
-    warm = {stage: Timing.of(times).median for stage, times in results["whole_run"]["warm"].items()}
-    stages = [stage for stage in warm if stage not in ("process", "total")]
-    return ", ".join(f"{stage} {100 * warm[stage] / warm['process']:.0f} %" for stage in stages)
 
 
 def launch_share(results: Results) -> str:
@@ -149,60 +132,28 @@ def stepping_table(measured: dict[str, list[Entry]]) -> str:
     return table(["time of a step", *(f"{n} × {n}" for n in measured), "largest error", "compile"], rows)
 
 
-def ratio_table(measured: dict[str, list[Entry]]) -> str:
-    """Table of the times of peers over that of this program."""
-    return table(
-        ["time / this program's", *(f"{n} × {n}" for n in measured)],
-        [
-            [entry["name"], *(_ratio(entries[index], entries[0]) for entries in measured.values())]
-            for index, entry in enumerate(next(iter(measured.values())))
-            if index
-        ],
-    )
-
-
-def narrow_step_table(narrow: Results) -> str:
-    """Table of the time of a step with vectors of 256 bits."""
+def narrow_table(narrow: dict[str, list[Entry]]) -> str:
+    """Table of the time of a step of the fastest peers at every size, with vectors of 256 bits."""
     if not narrow:
         return f"(this processor has none wider than {NARROW} bits: the tables above are of these)"
-    return size_table(narrow["stepping"])
+    names = [entry["name"] for entry in next(iter(narrow.values()))]
+    return table(["points", *names], [[f"{n} × {n}", *map(_cell, entries)] for n, entries in narrow.items()])
 
 
-def narrow_picture_table(narrow: Results) -> str:
-    """Table of the time of a picture with vectors of 256 bits."""
-    if not narrow:
-        return ""
-    rows = [
-        [f"{name}, {kind}", *(_cell(entries[index]) for entries in by_pixels.values())]
-        for kind, by_pixels in narrow["drawing"].items()
-        for index, name in enumerate(entry["name"] for entry in next(iter(by_pixels.values())))
-    ]
-    head = table(["time of a picture", *(f"{n} × {n}" for n in narrow["drawing"]["lit"])], rows)
-    return f"{head}\n\nOur lit picture takes {remap_ratios(narrow['drawing'])} times as long as `{READY}`."
-
-
-def remap_ratios(measured: dict[str, dict[str, list[Entry]]]) -> str:
-    """Format the times of a lit picture over cv2.remap with ready maps, for every size."""
-    ratios = []
-    for pixels, lit in measured["lit"].items():
-        ready = next(entry for entry in measured["flat"][pixels] if entry["name"] == READY)
-        ratios.append(f"{_ratio(lit[0], ready)} ({pixels} × {pixels})")
-    return " and ".join(ratios)
-
-
-def drawing_table(measured: dict[str, list[Entry]]) -> str:
-    """Table of the time of a picture of every peer."""
-    first = next(iter(measured.values()))
+def drawing_table(measured: dict[str, dict[str, list[Entry]]]) -> str:
+    """Table of the time of a picture of every peer, lit and flat."""
     rows = []
-    for index, entry in enumerate(first):
-        agreement = "-" if entry["answer"] is None else f"{entry['answer']:.1f} dB"
-        cells = [
-            cell
-            for entries in measured.values()
-            for cell in (_cell(entries[index]), _ratio(entries[index], entries[0]))
-        ]
-        rows.append([entry["name"], *cells, agreement, _compile(entry)])
-    head = [word for n in measured for word in (f"{n} × {n}", "/ ours")]
+    for kind, by_pixels in measured.items():
+        for index, entry in enumerate(next(iter(by_pixels.values()))):
+            agreement = "-" if entry["answer"] is None else f"{entry['answer']:.1f} dB"
+            cells = [
+                cell
+                for entries in by_pixels.values()
+                for cell in (_cell(entries[index]), _ratio(entries[index], entries[0]))
+            ]
+            name = entry["name"] if kind == "lit" else f"{entry['name']}, {kind}"
+            rows.append([name, *cells, agreement, _compile(entry)])
+    head = [word for n in next(iter(measured.values())) for word in (f"{n} × {n}", "/ ours")]
     return table(["time of a picture", *head, "PSNR", "compile"], rows)
 
 
@@ -258,28 +209,9 @@ def pictures(results: Results) -> dict[str, dict[str, list[float]]]:
     return {f"{size} × {size}": times for size, times in results["looks"]["pictures"].items()}
 
 
-def lens_ratios(measured: dict[str, dict[str, list[float]]]) -> str:
-    """Format the range of ratios of times with and without a lens, of pictures and labels."""
-    ratios = [
-        Timing.of(times[f"{kind}, lens"]).median / Timing.of(times[f"{kind}, pinhole"]).median
-        for times in measured.values()
-        for kind in (looks.INSTRUMENTED, looks.LABELS)
-    ]
-    return f"{min(ratios):.2f} to {max(ratios):.2f}"
-
-
-def rates_table(measured: dict[str, list[float]]) -> str:
-    """Table of the frames per second of runs."""
-    return table(
-        ["512 × 512 pixels", "frames a second"],
-        [[name, f"{Timing.of(rates).median:.0f}"] for name, rates in measured.items()],
-    )
-
-
-def size_table(measured: dict[str, list[Entry]]) -> str:
-    """Table of the time of a step of the fastest peers at every size."""
-    names = [entry["name"] for entry in next(iter(measured.values()))]
-    return table(["points", *names], [[f"{n} × {n}", *map(_cell, entries)] for n, entries in measured.items()])
+def rates(measured: dict[str, list[float]]) -> str:
+    """Format the frames per second of runs."""
+    return ", ".join(f"{Timing.of(samples).median:.0f} {name}" for name, samples in measured.items()) + " a second"
 
 
 def threads_table(measured: dict[str, dict[str, list[Entry]]]) -> str:
@@ -292,65 +224,56 @@ def threads_table(measured: dict[str, dict[str, list[Entry]]]) -> str:
     return table(["work", *(f"{count} threads" if count != "1" else "1 thread" for count in counts)], rows)
 
 
-def machine_table(rates: Results) -> str:
-    """Table of the machine's rates."""
+def machine_rates(rates: Results) -> str:
+    """Format the machine's rates."""
     if rates["failure"]:
         return f"(not measured: {rates['failure']})"
-    rows = [
-        ["multiplications with addition", f"{rates['flops'] / 1e9:.0f} Gflop/s"],
-        ["reciprocal square roots", f"{rates['roots'] / 1e9:.2g} G/s"],
-    ]
-    for points, bandwidth in rates["bandwidth"].items():
-        rows.append([f"triad over the state of {points} × {points} points", f"{bandwidth / 1e9:.0f} GB/s"])
-    rows.append(["launch of an empty kernel", format_duration(rates["launch"])])
-    rows.append([f"`advance(1)` of {bounds.SMALLEST} × {bounds.SMALLEST} points", format_duration(rates["one_step"])])
-    return table(["quantity", "measured"], rows)
+    bandwidths = [rate / 1e9 for rate in rates["bandwidth"].values()]
+    return (
+        f"{rates['flops'] / 1e9:.0f} Gflop/s in multiplications with addition, {rates['roots'] / 1e9:.2g} G/s of "
+        f"reciprocal square roots, {min(bandwidths):.0f} to {max(bandwidths):.0f} GB/s in a triad over the state "
+        f"of a sheet, {format_duration(rates['launch'])} for an empty launch"
+    )
 
 
-def step_bound_table(results: Results) -> str:
-    """Table of the time of a step against its lower bounds, at every size."""
+def bound_table(results: Results) -> str:
+    """Table of the times of steps and pictures against their lower bounds, at every size."""
     rates = results["bounds"]
-    if rates["failure"] or "size" not in results:
+    if rates["failure"] or "size" not in results or "drawing" not in results:
         return NOT_MEASURED
-    rows = []
+    works = {}
     for points, entries in results["size"].items():
-        if points not in rates["bandwidth"] or not entries[0]["samples"]:
-            continue
-        count = int(points) ** 2
-        least = {
-            "bytes": bounds.STEP_BYTES * count / rates["bandwidth"][points],
-            "flops": bounds.STEP_FLOPS * count / rates["flops"],
-            "roots": bounds.STEP_ROOTS * count / rates["roots"],
-        }
-        rows.append([f"{points} × {points}", *_against(Timing.of(entries[0]["samples"]).median, least)])
-    return table(["points", "step", "bytes", "flops", "roots", "bound by", "of the bound"], rows)
-
-
-def drawing_bound_table(results: Results) -> str:
-    """Table of the time of a picture against its lower bounds, at every size."""
-    rates = results["bounds"]
-    if rates["failure"] or "drawing" not in results:
-        return NOT_MEASURED
+        if points in rates["bandwidth"]:
+            count = int(points) ** 2
+            works[f"a step, {points} × {points} points"] = (
+                entries[0]["samples"],
+                {
+                    "bytes": bounds.STEP_BYTES * count / rates["bandwidth"][points],
+                    "flops": bounds.STEP_FLOPS * count / rates["flops"],
+                    "roots": bounds.STEP_ROOTS * count / rates["roots"],
+                },
+            )
     # The lowest bandwidth: that of memory.
     bandwidth = min(rates["bandwidth"].values())
-    rows = []
     for pixels, entries in results["drawing"]["lit"].items():
         count = int(pixels) ** 2
-        least = {
-            "bytes": bounds.COLOUR_BYTES * 2 * count / bandwidth,
-            "flops": bounds.PIXEL_FLOPS * count / rates["flops"],
-            "launch": rates["launch"],
-        }
-        if entries[0]["samples"]:
-            rows.append([f"{pixels} × {pixels}", *_against(Timing.of(entries[0]["samples"]).median, least)])
-    return table(["pixels", "picture", "bytes", "flops", "launch", "bound by", "of the bound"], rows)
-
-
-def _against(seconds: float, least: dict[str, float]) -> list[str]:
-    """Return cells of a time against lower bounds, the greatest of which counts."""
-    binding = max(least, key=lambda kind: least[kind])
-    times = map(format_duration, (seconds, *least.values()))
-    return [*times, binding, f"{100 * least[binding] / seconds:.0f} %"]
+        works[f"a picture, {pixels} × {pixels} pixels"] = (
+            entries[0]["samples"],
+            {
+                "bytes": bounds.COLOUR_BYTES * 2 * count / bandwidth,
+                "flops": bounds.PIXEL_FLOPS * count / rates["flops"],
+                "launch": rates["launch"],
+            },
+        )
+    kinds = ("bytes", "flops", "roots", "launch")
+    rows = []
+    for work, (samples, least) in works.items():
+        if samples:
+            median = Timing.of(samples).median
+            binding = max(least, key=lambda kind: least[kind])
+            cells = [format_duration(least[kind]) if kind in least else "-" for kind in kinds]
+            rows.append([work, format_duration(median), *cells, binding, f"{100 * least[binding] / median:.0f} %"])
+    return table(["work", "time", *kinds, "bound by", "of the bound"], rows)
 
 
 def _cell(entry: Entry) -> str:

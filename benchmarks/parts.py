@@ -18,9 +18,6 @@ STEPPING, DRAWING = "benchmarks.stepping.measure", "benchmarks.drawing.measure"
 # Width of the vectors of AVX2 [bits].
 NARROW = 256
 
-# This program, and the fastest possible picture.
-OURS, READY = "taichi_msm", "cv2.remap, maps ready"
-
 # The picture, and the sheets for every number of threads.
 PIXELS, REFINE = 512, 10
 THREADS_POINTS = (331, 1024)
@@ -64,18 +61,17 @@ def stepping(effort: Effort, progress: Progress) -> dict[str, Entries]:
 
 def drawing(effort: Effort, progress: Progress) -> dict[str, dict[str, Entries]]:
     """Time pictures of all peers, lit and flat."""
-    return _draw_peers({"lit": LIT, "flat": FLAT}, effort, progress)
+    return {
+        "lit": _draw_peers(LIT, True, effort, prefixed(progress, "lit")),
+        "flat": _draw_peers(FLAT, False, effort, prefixed(progress, "flat")),
+    }
 
 
-def narrow(effort: Effort, progress: Progress) -> dict[str, Any]:
-    """Time the fastest peers with vectors of 256 bits, if the processor has wider ones."""
+def narrow(effort: Effort, progress: Progress) -> dict[str, Entries]:
+    """Time steps of sheets of every size with vectors of 256 bits, if the processor has wider ones."""
     if vector_bits() <= NARROW:
         return {}
-    peers = {"lit": {OURS: LIT[OURS]}, "flat": {name: FLAT[name] for name in (OURS, READY)}}
-    return {
-        "stepping": _step(FASTEST, effort.sizes, effort, progress, bits=NARROW),
-        "drawing": _draw_peers(peers, effort, progress, bits=NARROW),
-    }
+    return _step(FASTEST, effort.sizes, effort, progress, bits=NARROW)
 
 
 def size(effort: Effort, progress: Progress) -> dict[str, Entries]:
@@ -130,31 +126,17 @@ def _step(
     }
 
 
-def _draw_peers(
-    peers: Mapping[str, Mapping[str, str]], effort: Effort, progress: Progress, **work: Any
-) -> dict[str, dict[str, Entries]]:
-    """Time pictures of several sizes, lit and flat."""
+def _draw_peers(peers: Mapping[str, str], lit: bool, effort: Effort, progress: Progress) -> dict[str, Entries]:
+    """Time pictures of several sizes."""
     return {
-        kind: {
-            str(pixels): _race(
-                DRAWING,
-                modules,
-                effort.rounds,
-                prefixed(progress, f"{kind} {pixels} px"),
-                pixels=pixels,
-                refine=REFINE,
-                lit=kind == "lit",
-                **work,
-            )
-            for pixels in effort.pixels
-        }
-        for kind, modules in peers.items()
+        str(n): _race(DRAWING, peers, effort.rounds, prefixed(progress, f"{n} px"), pixels=n, refine=REFINE, lit=lit)
+        for n in effort.pixels
     }
 
 
 def _draw(effort: Effort, progress: Progress, **work: Any) -> Entries:
     """Time this program's drawing."""
-    return _race(DRAWING, {OURS: LIT[OURS]}, effort.rounds, progress, **work)
+    return _race(DRAWING, {"taichi_msm": LIT["taichi_msm"]}, effort.rounds, progress, **work)
 
 
 def prefixed(progress: Progress, prefix: str) -> Progress:

@@ -1,8 +1,8 @@
-"""Plots of time against size, refinement, resolution and threads, in the style of `taichi-msm study`."""
+"""Plots of time against size, refinement and resolution, in the style of `taichi-msm study`."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -18,9 +18,7 @@ from taichi_msm.plot_style import (
     BLUE,
     DPI,
     GREEN,
-    GREY,
     INK,
-    ONE_COLUMN_WIDTH,
     ORANGE,
     PURPLE,
     STYLE,
@@ -40,20 +38,15 @@ Series = dict[str, dict[float, Timing]]
 
 def draw(results: Results, folder: Path) -> None:
     """Write the plots of all measured parts."""
-    for name, width, panels in (
-        ("size", TWO_COLUMN_WIDTH, (_per_step, _per_point)),
-        ("drawing", TWO_COLUMN_WIDTH, (_refine, _resolution)),
-        ("threads", ONE_COLUMN_WIDTH, (_threads,)),
-    ):
-        parts = ("refine", "resolution") if name == "drawing" else (name,)
-        if all(part in results for part in parts):
-            _figure(results, width, panels, folder / f"performance-{name}.png")
+    if "size" in results:
+        _figure(results, (_per_step, _per_point), folder / "performance-size.png")
+    if "refine" in results and "resolution" in results:
+        _figure(results, (_refine, _resolution), folder / "performance-drawing.png")
 
 
-def _figure(results: Results, width: float, panels: Iterable[Callable[[Axes, Results], None]], path: Path) -> None:
-    panels = tuple(panels)
+def _figure(results: Results, panels: tuple[Callable[[Axes, Results], None], ...], path: Path) -> None:
     with style.context(STYLE, after_reset=True):
-        figure = Figure(figsize=(width, HEIGHT), dpi=DPI, layout="constrained")
+        figure = Figure(figsize=(TWO_COLUMN_WIDTH, HEIGHT), dpi=DPI, layout="constrained")
         FigureCanvasAgg(figure)
         for panel, axes in zip(panels, figure.subplots(1, len(panels), squeeze=False)[0], strict=True):
             panel(axes, results)
@@ -95,27 +88,6 @@ def _resolution(axes: Axes, results: Results) -> None:
     axes.set(title="Drawing against resolution", ylabel="ms", xlabel="n, of n × n pixels; 331 × 331 vertices")
     _plot(axes, series, lambda n: 1e3)
     _tick_at(axes.xaxis, sorted(series["taichi_msm"]))
-
-
-def _threads(axes: Axes, results: Results) -> None:
-    axes.set(title="Speed-up", xlabel="threads", ylabel="times as fast as with one")
-    counts: set[float] = set()
-    for (work, by_count), line in zip(results["threads"].items(), ("-", "--", ":"), strict=False):
-        for name, times in _by_peer(by_count).items():
-            if 1 not in times:
-                continue
-            counts |= set(times)
-            speed = [times[1].median / times[count].median for count in sorted(times)]
-            label = f"{name}, {work}"
-            axes.plot(
-                sorted(times), speed, line, color=COLOURS[name], marker=MARKERS[name], markersize=4.5, label=label
-            )
-    axes.set_xscale("log")
-    axes.set_yscale("log")
-    axes.plot(sorted(counts), sorted(counts), color=GREY, linewidth=0.7, label="ideal")
-    _tick_at(axes.xaxis, sorted(counts))
-    _tick_plainly(axes.yaxis)
-    axes.legend(loc="center left", bbox_to_anchor=(1.02, 0.5))
 
 
 def _by_peer(measured: dict[str, list[Results]]) -> Series:

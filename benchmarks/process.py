@@ -94,6 +94,5 @@ def _environment(threads: int | None, bits: int | None, compiler: str) -> dict[s
             "NUMBA_CPU_NAME": AVX2,
             "NUMBA_CPU_FEATURES": "+avx2,+fma",
             "NUMBA_CACHE_DIR": str(CACHE / "numba-256"),
-            "OPENCV_CPU_DISABLE": "AVX512_SKX,AVX512_COMMON,AVX512_ICL",
         }
     return environment

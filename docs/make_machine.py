@@ -24,6 +24,7 @@ from taichi_msm import FitResult, SceneError, Simulation, fit, load_scene
 from taichi_msm.machines.cells import read_workbook
 from taichi_msm.machines.reader import EXPECTED, read_machine_test
 from taichi_msm.plot_style import BLUE, DPI, STYLE, VERMILION
+from taichi_msm.study.format import markdown_table
 
 DOCS = Path(__file__).parent
 RECORD, PAGE, TEMPLATE = DOCS / "machine-fits.json", DOCS / "machine-fits.md", DOCS / "machine-fits.template"
@@ -39,16 +40,19 @@ BEEF_KEYS = {
     "young [kPa]": ("tissue.foundation.young", 1e-3),
     "lock [mm]": ("tissue.foundation.lock", 1e3),
     "contact [mm]": ("contact", 1e3),
-    "share 1": ("tissue.relaxation.0.share", 1),
-    "time 1 [s]": ("tissue.relaxation.0.time", 1),
-    "share 2": ("tissue.relaxation.1.share", 1),
-    "time 2 [s]": ("tissue.relaxation.1.time", 1),
+    "share 1": ("tissue.relaxation.0.share", 1.0),
+    "time 1 [s]": ("tissue.relaxation.0.time", 1.0),
+    "share 2": ("tissue.relaxation.1.share", 1.0),
+    "time 2 [s]": ("tissue.relaxation.1.time", 1.0),
 }
 STRIP_KEYS = {
     "young [kPa]": ("tissue.young", 1e-3),
-    "lock": ("tissue.stiffening.lock", 1),
-    "factor": ("tissue.stiffening.factor", 1),
+    "lock": ("tissue.stiffening.lock", 1.0),
+    "factor": ("tissue.stiffening.factor", 1.0),
 }
+RESIDUALS = {"rms [% of peak]": "rms", "largest [% of peak]": "largest"}
+
+Keys = dict[str, tuple[str, float]]
 
 
 def beef_scene(thickness: float, depth: float) -> dict[str, Any]:
@@ -125,45 +129,42 @@ def summarise(result: FitResult) -> dict[str, Any]:
     }
 
 
-def table(record: dict[str, Any], keys: dict[str, tuple[str, float]]) -> list[str]:
-    """Format fits with the same parameters as a table."""
-    lines = [f"| test | rms [% of peak] | largest | {' | '.join(keys)} |", "|---" * (3 + len(keys)) + "|"]
-    for name, numbers in record.items():
-        if "error" in numbers:
-            lines.append(f"| {name} | {numbers['error']} |")
-        elif set(numbers["parameters"]) == {key for key, _ in keys.values()}:
-            cells = [_cell(numbers, key, scale) for key, scale in keys.values()]
-            lines.append(
-                f"| {name} | {100 * numbers['rms']:.2f} | {100 * numbers['largest']:.1f} | {' | '.join(cells)} |"
-            )
-    return lines
+def fit_column(numbers: dict[str, Any], keys: Keys) -> dict[str, str]:
+    """Format residuals and parameters of a fit by their names; an end beyond a bound stays open."""
+    column = {name: f"{100 * numbers[kind]:#.2g}" for name, kind in RESIDUALS.items()}
+    for name, (key, scale) in keys.items():
+        value, *interval = numbers["parameters"][key]
+        low, high = ("…" if end is None else f"{scale * end:.3g}" for end in interval)
+        column[name] = f"{scale * value:.3g} ({low} to {high})"
+    return column
 
 
-def _cell(numbers: dict[str, Any], key: str, scale: float) -> str:
-    """Format a value with its interval; an end beyond a bound stays open."""
-    if key in numbers["not_identifiable"]:
-        return "not identifiable"
-    value, low, high = (None if number is None else scale * number for number in numbers["parameters"][key])
-    if low is None and high is not None:
-        return f"below {high:.2g}"
-    return f"{value:.3g} ({'…' if low is None else f'{low:.3g}'} to {'…' if high is None else f'{high:.3g}'})"
+def range_column(fits: list[dict[str, Any]]) -> dict[str, str]:
+    """Format the medians and ranges of the fits of beef, of parameters over the fits with a bounded interval."""
+    samples = {name: [100 * numbers[kind] for numbers in fits] for name, kind in RESIDUALS.items()}
+    for name, (key, scale) in BEEF_KEYS.items():
+        estimates = [numbers["parameters"][key] for numbers in fits]
+        if key.startswith("tissue."):
+            samples[name] = [scale * estimate[0] for estimate in estimates if None not in estimate]
+    return {name: f"{np.median(x):.3g} ({min(x):.3g} to {max(x):.3g})" for name, x in samples.items()}
 
 
 def write_page(record: dict[str, Any]) -> None:
     """Write the page from its template."""
     beef = [numbers for numbers in record.values() if "contact" in numbers.get("parameters", ())]
-    rms = 100 * np.array([numbers["rms"] for numbers in beef] or [np.nan])
+    columns = {"FF2A": fit_column(record[SLICE], BEEF_KEYS), f"{len(beef)} slices": range_column(beef)}
+    for name, tissue in ("pig-skin-05-p-1", "pig skin"), ("pig-mucosa-08-a-1", "pig mucosa"):
+        columns[tissue] = fit_column(record[name], STRIP_KEYS)
+    names = dict.fromkeys([*RESIDUALS, *BEEF_KEYS, *STRIP_KEYS])
+    rows = [[name, *(column.get(name, "") for column in columns.values())] for name in names]
     text = TEMPLATE.read_text(encoding="utf-8")
-    for name, lines in {
-        "beef": table(record, BEEF_KEYS),
-        "strips": table(record, STRIP_KEYS),
-        "count": [str(len(beef))],
-        "median": [f"{np.median(rms):.2g}"],
-        "ninth": [f"{np.quantile(rms, 0.9):.2g}"],
-        "worst": [f"{rms.max():.2g}"],
-        "rejected": [str(sum(numbers["rejected"] for numbers in beef))],
+    for name, value in {
+        "numbers": markdown_table(["", *columns], rows, left_columns=range(1 + len(columns))),
+        "count": len(beef),
+        "unidentified": sum(bool(numbers["not_identifiable"]) for numbers in beef),
+        "rejected": sum(numbers["rejected"] for numbers in beef),
     }.items():
-        text = text.replace(f"{{{name}}}", "\n".join(lines))
+        text = text.replace(f"{{{name}}}", str(value))
     PAGE.write_text(text, encoding="utf-8")
 
 

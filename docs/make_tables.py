@@ -17,7 +17,8 @@ from taichi_msm.camera_files.readers import CALIBRATION_READERS, TRAJECTORY_READ
 from taichi_msm.camera_files.trajectory import TrajectoryReader
 from taichi_msm.load.scene_file import schema
 from taichi_msm.scene.section import Section
-from taichi_msm.sweeps.spec import Distribution, SweepSettings
+from taichi_msm.sweeps.distribution import Distribution
+from taichi_msm.sweeps.spec import SweepSettings
 from taichi_msm.view.events import KEYS, POINTER
 
 DOCS = Path(__file__).parent

@@ -1,4 +1,4 @@
-"""Functions with which a formula in plain arithmetic serves NumPy, kernels and dual numbers."""
+"""Functions with which a formula in plain arithmetic serves NumPy, kernels (`system.kernel_operations`) and `dual`."""
 
 from __future__ import annotations
 
@@ -9,19 +9,22 @@ import numpy as np
 
 
 class Operations(NamedTuple):
-    """Functions of NumPy, a kernel or dual numbers that formulas use in addition to + - * /."""
+    """Functions that formulas use in addition to + - * /, of coefficients and of variables."""
 
     sqrt: Callable[..., Any]
-    log: Callable[..., Any]
     exp: Callable[..., Any]
+    log: Callable[..., Any]
     arctan: Callable[..., Any]
     maximum: Callable[..., Any]
     minimum: Callable[..., Any]
     where: Callable[..., Any]
     wrap: Callable[[Callable[..., Any]], Callable[..., Any]]  # makes a formula callable from another one
-    hold: Callable[[Any], Any]  # keeps an intermediate result in a variable
+    hold: Callable[[Any], Any]  # keeps an intermediate result in a variable of the kernel
 
 
-NUMPY = Operations(
-    np.sqrt, np.log, np.exp, np.arctan, np.maximum, np.minimum, np.where, lambda function: function, lambda value: value
-)
+def unchanged(value: Any) -> Any:
+    """Return a formula or a result: `wrap` and `hold` outside kernels."""
+    return value
+
+
+NUMPY = Operations(np.sqrt, np.exp, np.log, np.arctan, np.maximum, np.minimum, np.where, unchanged, unchanged)

@@ -6,7 +6,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, ClassVar
 
-from taichi_msm.arithmetic import NUMPY, Operations
+from taichi_msm.arithmetic import NUMPY, Operations, unchanged
 
 
 @dataclass(frozen=True)
@@ -15,7 +15,7 @@ class Dual:
 
     value: Any
     slope: Any
-    hold: Callable[[Any], Any] = NUMPY.hold
+    hold: Callable[[Any], Any] = unchanged
 
     __array_ufunc__ = None  # NumPy arrays then defer to the operators of this class.
     _data_oriented: ClassVar[bool] = True  # The compiler then keeps variables of this class as they are.
@@ -46,6 +46,9 @@ class Dual:
 
     def __rsub__(self, other: Any) -> Dual:
         return self._new(other - self.value, 0 - self.slope)
+
+    def __neg__(self) -> Dual:
+        return self._new(0 - self.value, 0 - self.slope)
 
     def __lt__(self, other: Any) -> Any:
         return self.value < _parts(other)[0]
@@ -94,7 +97,7 @@ def dual_operations(base: Operations) -> Operations:
         return either._new(base.where(condition, value, other), base.where(condition, slope, other_slope))
 
     return base._replace(
-        wrap=lambda function: function,
+        wrap=unchanged,
         sqrt=lift(base.sqrt, lambda slope, _, root: slope / (2 * root)),
         log=lift(base.log, lambda slope, value, _: slope / value),
         arctan=lift(base.arctan, lambda slope, value, _: slope / (1 + value * value)),
@@ -103,3 +106,6 @@ def dual_operations(base: Operations) -> Operations:
         minimum=choose(base.minimum, lambda a, b: a < b),
         where=where,
     )
+
+
+DUAL = dual_operations(NUMPY)

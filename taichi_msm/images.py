@@ -150,8 +150,8 @@ def _open(path: str, sha256: str | None = None) -> Iterator[Image.Image]:
         except (Image.DecompressionBombWarning, Image.DecompressionBombError):
             limit = (Image.MAX_IMAGE_PIXELS or 0) // 10**6
             raise PictureError(f"{path} has more than {limit} million pixels", "scale it down") from None
-        except PermissionError:
-            raise PictureError(f"{path} may not be read", "change its permissions") from None
+        except PermissionError as error:
+            raise _unreadable(path, error) from None
         except Exception as error:
             raise PictureError(f"{path} cannot be decoded ({error})", "save it again") from None
 
@@ -207,6 +207,8 @@ def _require_file(path: str) -> None:
 
 
 def _unreadable(path: str, error: OSError) -> PictureError:
+    if isinstance(error, PermissionError):
+        return PictureError(f"{path} may not be read", "change its permissions")
     return PictureError(f"{path}: {(error.strerror or str(error)).lower()}", "name a picture that can be read")
 
 

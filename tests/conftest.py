@@ -22,6 +22,8 @@ from tests.scenes import SMALL, speckle
 
 # The slowest test files, which begin.
 SLOWEST = {f"test_{name}" for name in ("docs", "vulkan", "lens", "rest", "cluster", "sweep", "contact", "study", "fit")}
+# Test files that start processes.
+WITH_PROCESSES = {f"test_{name}" for name in ("cli", "compiler", "datasets", "files", "runtime", "sameness", "sweep")}
 
 
 def pytest_addoption(parser: pytest.Parser) -> None:
@@ -30,11 +32,18 @@ def pytest_addoption(parser: pytest.Parser) -> None:
 
 @pytest.hookimpl(tryfirst=True)
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Mark all but the default cases as slow, and begin with the slowest files."""
+    """Mark all but the default cases as slow, and the quick tests; begin with the slowest files.
+
+    Quick are tests without a device and without processes, and those that compare a kernel with its twin.
+    """
     for item in items:
         chosen = item.get_closest_marker("default_cases")
         if isinstance(item, pytest.Function) and chosen and item.callspec.id not in chosen.args:
             item.add_marker(pytest.mark.slow)
+        is_default = not (item.get_closest_marker("slow") or item.get_closest_marker("fuzz"))
+        is_light = "device" not in getattr(item, "fixturenames", ()) and item.path.stem not in WITH_PROCESSES
+        if is_default and (is_light or "_twin" in item.name):
+            item.add_marker(pytest.mark.quick)
     items.sort(key=lambda item: item.path.stem not in SLOWEST)
 
 

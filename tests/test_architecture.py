@@ -14,7 +14,7 @@ PACKAGE = Path(__file__).parent.parent / "taichi_msm"
 LAYERS = [
     {"arithmetic", "errors", "plot_style", "version"},
     {"dual", "system"},
-    {"images", "laws", "lenses", "shapes"},
+    {"images", "integrators", "laws", "lenses", "shapes"},
     {"camera_files"},
     {"scene"},
     {"model"},

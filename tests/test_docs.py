@@ -390,7 +390,6 @@ def test_scenes_have_the_fitted_parameters() -> None:
 
 
 def test_tests_named_on_pages_exist() -> None:
-    named = re.findall(r"`(tests/[\w/]+\.py)::(\w+)`", read(DOCS / "tests.md").split("\n## Mutants\n")[0])
-    assert len(named) > 100
-    for file, test in named:
-        assert re.search(rf"^(async )?def {test}\(", read(ROOT / file), re.MULTILINE), test
+    named = [name for page in PAGES for name in re.findall(r"`(tests/[\w/.]+)`", read(page))]
+    assert len(named) > 20
+    assert not [name for name in named if not (ROOT / name).exists()]

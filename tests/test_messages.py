@@ -147,6 +147,7 @@ WITHOUT_MESSAGES = {
 }
 CALLS_WITHOUT_MESSAGES = re.compile(
     r"(re|textwrap)\.\w+|key|((click|options)\.)?\w*(option|argument|Option)|CalibrationReader|TrajectoryReader|Coefficient"
+    r"|LawKey|Integrator|Continuous"
 )
 
 

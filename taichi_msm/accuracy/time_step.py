@@ -29,7 +29,6 @@ from taichi_msm.errors import Pause, ProgressCallback, SceneError
 from taichi_msm.model.plan import Plan
 from taichi_msm.model.sheet import rest_positions
 from taichi_msm.model.tools import overlap
-from taichi_msm.model.verlet import convergence_order
 from taichi_msm.scene.section import MAX_TOLERANCE
 from taichi_msm.solver.dynamics import Dynamics
 from taichi_msm.system.runtime import Device
@@ -124,7 +123,7 @@ class TimeStepCompanion:
     """
 
     def __init__(self, plan: Plan, steps: int, device: Device, cores: int | None = None) -> None:
-        self._order, in_f64 = convergence_order(plan), plan.with_grid(precision="f64")
+        self._order, in_f64 = plan.convergence_order, plan.with_grid(precision="f64")
         coarse = 0 < steps < plan.grid.steps_per_frame
         self._separate = plan.grid.precision == "f64" or not coarse
         self._dynamics = Dynamics(in_f64, device, cores=cores)

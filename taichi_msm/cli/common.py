@@ -23,16 +23,10 @@ EXIT_CODES = {"complete": DONE, "diverged": DIVERGED}
 
 
 def result_directory(out: str | None, default: str = "", option: str = "--out") -> Path:
-    """Return the directory of results: the value of an option, or a default in output/.
+    """Return the directory of results: the value `out` of an option, or a default in output/.
 
-    Args:
-        out: value of the option; None for the default.
-        default: name of the default directory within output/.
-        option: name of the option, for messages.
-
-    Raises:
-        click.BadParameter: when the value is empty, or the default is not the name of a directory.
-        FilesError: when the path of the default directory has a symbolic link.
+    An empty value, or a default that is not the name of a directory, raises a BadParameter; a symbolic link in the path
+    of the default raises a FilesError.
     """
     if out == "":
         raise click.BadParameter("is empty; give a directory", param_hint=option)
@@ -73,15 +67,9 @@ def prefix_errors(scene: str) -> Iterator[None]:
 
 @contextmanager
 def show_progress(interruption: Interruption, quiet: bool) -> Iterator[Callable[[str, int, int], None]]:
-    """Show the progress of the block.
+    """Show the progress of the block, by a callback for the stage, and the finished and total number of its items.
 
-    Args:
-        interruption: signal handler, which starts to listen at the first stage.
-        quiet: whether to show nothing.
-
-    Yields:
-        A callback for the stage, and the finished and total number of its items; raises KeyboardInterrupt after an
-        interruption.
+    The callback raises a KeyboardInterrupt after an interruption, which is listened to from the first stage on.
     """
     from taichi_msm.cli.console import ProgressDisplay
 
@@ -98,19 +86,7 @@ def show_progress(interruption: Interruption, quiet: bool) -> Iterator[Callable[
 
 @contextmanager
 def report_interruption(interruption: Interruption, as_json: bool, rest: Callable[[], str]) -> Iterator[None]:
-    """Turn a KeyboardInterrupt of the block into a message and an exit.
-
-    Args:
-        interruption: signal handler, with the exit code.
-        as_json: whether to print the message as JSON, too.
-        rest: returns the end of the message after "interrupted".
-
-    Yields:
-        None.
-
-    Raises:
-        click.exceptions.Exit: in place of the KeyboardInterrupt.
-    """
+    """Turn a KeyboardInterrupt of the block into an exit with a message, in which `rest` follows "interrupted"."""
     try:
         yield
     except KeyboardInterrupt:
@@ -125,17 +101,7 @@ def interruptible(
     interruption: Interruption | None = None,
     rest: Callable[[], str] = lambda: "; nothing was written",
 ) -> Iterator[Callable[[str, int, int], None]]:
-    """Show the progress of the block, with `show_progress` and `report_interruption`.
-
-    Args:
-        as_json: whether the command prints JSON, and so no progress.
-        quiet: whether to show no progress.
-        interruption: signal handler; by default a new one.
-        rest: returns the end of the message after "interrupted".
-
-    Yields:
-        The callback of `show_progress`.
-    """
+    """Show the progress of the block, with `show_progress` and `report_interruption`."""
     interruption = interruption or Interruption()
     with report_interruption(interruption, as_json, rest), show_progress(interruption, quiet or as_json) as progress:
         yield progress
@@ -147,13 +113,7 @@ def print_json(value: Any) -> None:
 
 
 def report_failure(status: str, lines: Sequence[str], as_json: bool) -> None:
-    """Print the failure of a command on stderr.
-
-    Args:
-        status: error, diverged or interrupted; for JSON.
-        lines: lines of the message.
-        as_json: whether to print the message as a JSON object on stdout, too.
-    """
+    """Print a failure on stderr; as JSON also on stdout, with its status: error, diverged or interrupted."""
     write_stderr(lines)
     if as_json:
         print_json({"status": status, "errors": list(lines)})

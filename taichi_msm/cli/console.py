@@ -41,11 +41,7 @@ LINE_INTERVAL_S = 10.0
 
 
 class ProgressDisplay:
-    """Progress on stderr: a bar on a terminal, otherwise a line every `LINE_INTERVAL_S`.
-
-    Args:
-        quiet: whether to show nothing.
-    """
+    """Progress on stderr: a bar on a terminal, otherwise a line every `LINE_INTERVAL_S`; nothing if quiet."""
 
     def __init__(self, quiet: bool) -> None:
         self._quiet = quiet
@@ -56,13 +52,7 @@ class ProgressDisplay:
             self._task = self._bar.add_task(STAGES["start"], total=None, left="")
 
     def update(self, stage: str, done: int, total: int) -> None:
-        """Show the progress and the estimated remaining time of a stage.
-
-        Args:
-            stage: key of `STAGES`.
-            done: number of finished items.
-            total: number of all items; 0 if unknown.
-        """
+        """Show the progress of a stage of `STAGES` and its estimated remaining time; a total of 0 is unknown."""
         if self._quiet:
             return
         now = time.monotonic()
@@ -114,15 +104,7 @@ def _bar() -> Bar:
 
 
 def run_summary(record: Mapping[str, Any], directory: Path) -> str:
-    """Summarise a run in a few lines: frames, steps, forces, warnings and timings.
-
-    Args:
-        record: content of run.json.
-        directory: directory of the results.
-
-    Returns:
-        Text for the terminal.
-    """
+    """Summarise run.json in a few lines: frames, steps, forces, warnings and timings."""
     times, (rows, cols) = record["timings"], record["points"]
     named = {"companion runs" if stage == "pilot" else stage: seconds for stage, seconds in times.items()}
     stages = ", ".join(f"{stage} {seconds:.2f}" for stage, seconds in named.items() if stage != "total")

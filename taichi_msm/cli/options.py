@@ -16,19 +16,7 @@ class SuggestingChoice(click.Choice):  # type: ignore[type-arg]  # not generic b
     """Option type with a fixed set of words; its errors suggest the nearest word."""
 
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> str:
-        """Validate a word; see `click.ParamType.convert`.
-
-        Args:
-            value: the word.
-            param: the option, for messages.
-            ctx: context of the command, for messages.
-
-        Returns:
-            The word.
-
-        Raises:
-            click.BadParameter: when the word is not in the set.
-        """
+        """Validate a word; see `click.ParamType.convert`."""
         try:
             return str(super().convert(value, param, ctx))
         except click.BadParameter as error:
@@ -47,10 +35,7 @@ def parse_shard(text: str) -> tuple[int, int]:
 scene_argument = click.argument("scene", metavar="SCENE")
 image_option = click.option("--image", metavar="FILE", help="Picture on the sheet, instead of the scene's.")
 quality_option = click.option(
-    "--quality",
-    type=click.IntRange(1, 100),
-    metavar="N",
-    help="Quality of the MP4 film [%].  [default: 65]",
+    "--quality", type=click.IntRange(1, 100), metavar="N", help="Quality of the MP4 film [%].  [default: 65]"
 )
 set_option = click.option(
     "--set",

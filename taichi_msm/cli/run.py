@@ -163,11 +163,7 @@ def check(scene: str, image: str | None, overrides: tuple[str, ...], as_json: bo
         "disk": budget.disk_bytes,
         "disk_while_running": budget.disk_bytes + budget.working_bytes,
         "probes": (records := probe_records(loaded)),
-        "notes": [
-            *force_warnings(loaded, records),
-            *path_warnings(loaded, plan.tools),
-            *drawing_warnings(loaded),
-        ],
+        "notes": [*force_warnings(loaded, records), *path_warnings(loaded, plan.tools), *drawing_warnings(loaded)],
     }
     if as_json:
         common.print_json(report)

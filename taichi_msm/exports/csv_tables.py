@@ -28,18 +28,7 @@ TRACKS_HEADER = ("time", "point", "across", "down", "x", "y", "occluded", "posit
 
 
 def write(sources: Sequence[ExportSource], folder: Path) -> Iterator[list[str]]:
-    """Write the forces and tracks of runs.
-
-    Args:
-        sources: runs to export.
-        folder: existing, empty folder of the export.
-
-    Yields:
-        Warnings about each run in turn.
-
-    Raises:
-        FilesError: when a run has neither forces nor tracks, or its tables are damaged.
-    """
+    """Write the forces and tracks of runs; a run without both raises a FilesError."""
     writers = {"forces": (FORCES_HEADER, _write_forces), "tracks": (TRACKS_HEADER, _write_tracks)}
     with ExitStack() as opened:
         tables: dict[str, TextIO] = {}

@@ -39,7 +39,6 @@ LOADER_SIZE = (640, 512)
 
 
 def _write_run(run: FinishedRun, folder: Path, progress: ProgressCallback) -> list[str]:
-    """Write the frames, depths, masks and poses of a run."""
     camera, size = read_pinhole(run, FORMAT_NAME), run.scene.render.size
     _require_central(camera, size, run)
     for name in ("images", "depth", "masks"):

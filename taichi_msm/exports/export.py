@@ -198,8 +198,9 @@ def _name_run_in_errors(run: FinishedRun, name: str) -> Iterator[None]:
         raise FilesError(f"{run.directory}: its numbers are too large for {name}; run the scene again") from None
 
 
-def _name_runs(note: str, runs: Sequence[Path]) -> str:
-    return f"{runs[0]}{f' and {len(runs) - 1} more' if len(runs) > 1 else ''}: {note}"
+def _name_runs(note: str, directories: Sequence[Path]) -> str:
+    more = f" and {len(directories) - 1} more" if len(directories) > 1 else ""
+    return f"{directories[0]}{more}: {note}"
 
 
 def _write_index(runs: Sequence[FinishedRun], pairs: bool, path: Path) -> None:

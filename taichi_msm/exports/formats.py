@@ -160,12 +160,7 @@ def one_folder_per_run(write: RunWriter) -> FormatWriter:
 
 
 def one_path_per_run(write: RunWriter, suffix: str = "") -> FormatWriter:
-    """Return the writer of a format with a file or folder per run.
-
-    Args:
-        write: function that creates the file or folder of a run.
-        suffix: suffix of the file name; the stem is the number of the run.
-    """
+    """Return the writer of a format with a file or folder per run, named by the number of the run and `suffix`."""
 
     def write_all(sources: Sequence[ExportSource], folder: Path) -> Iterator[list[str]]:
         for run, name, progress in sources:
@@ -175,13 +170,9 @@ def one_path_per_run(write: RunWriter, suffix: str = "") -> FormatWriter:
 
 
 def read_runs(directories: Sequence[str | Path]) -> tuple[list[FinishedRun], int]:
-    """Read the records of runs, given as folders of runs or of sweeps.
+    """Read the records of runs, given as folders of runs or of sweeps; raise a FilesError if no run is complete.
 
-    Returns:
-        The runs, without the incomplete runs of sweeps; and the number of these.
-
-    Raises:
-        FilesError: as for `read_run`, and when no run is complete.
+    Return the runs, without the incomplete runs of sweeps; and the number of these.
     """
     runs, incomplete = [], 0
     for directory in map(Path, directories):

@@ -54,7 +54,6 @@ Numbers = NDArray[Any]
 
 
 def _write_run(run: FinishedRun, folder: Path, progress: ProgressCallback) -> list[str]:
-    """Write the animated surface with its picture, the tools and cameras."""
     positions, picture = run.positions(), picture_png(run)
     # A target has differences of positions and normals, float32.
     target_bytes = 2 * 3 * 4 * positions[0, ..., 0].size
@@ -170,32 +169,24 @@ class KeyFrames(NamedTuple):
     error: float  # largest interpolation error of any mass point in any frame [m]
 
 
-def key_frames(position: Array, limit: int, progress: ProgressCallback = lambda done, total: None) -> KeyFrames:
-    """Choose the keyframes of a motion: all frames if possible, otherwise by a greedy selection.
+def key_frames(positions: Array, limit: int, progress: ProgressCallback = lambda done, total: None) -> KeyFrames:
+    """Choose the keyframes of a motion: all frames if possible, otherwise at most `limit` by a greedy selection.
 
     The selection starts with the first and last frame, and repeatedly adds the frame with the largest interpolation
-    error.
-
-    Args:
-        position: positions at equidistant times [m], shape (frames, rows, cols, 3).
-        limit: maximum number of keyframes, 2 or more.
-        progress: called with the chosen and the maximum number of keyframes.
-
-    Returns:
-        Keyframes, and the largest interpolation error [m].
+    error. The positions are those at equidistant times [m], shape (frames, rows, cols, 3).
 
     Source: Douglas and Peucker 1973, for all mass points, limited by the number of keyframes, not by a tolerance.
     """
-    count = len(position)
+    count = len(positions)
     if count <= limit:
         return KeyFrames(list(range(count)), 0.0)
     chosen = [0, count - 1]
-    spans = [_worst_frame(position, 0, count - 1)]
+    spans = [_worst_frame(positions, 0, count - 1)]
     while len(chosen) < limit and (worst := min(spans)).error < 0:
         progress(len(chosen), limit)
         spans.remove(worst)
         chosen.append(worst.frame)
-        spans += [_worst_frame(position, worst.first, worst.frame), _worst_frame(position, worst.frame, worst.last)]
+        spans += [_worst_frame(positions, worst.first, worst.frame), _worst_frame(positions, worst.frame, worst.last)]
     return KeyFrames(sorted(chosen), -min(spans).error)
 
 
@@ -208,23 +199,19 @@ class _Span(NamedTuple):
     last: int  # keyframe at the end
 
 
-def _worst_frame(position: Array, first: int, last: int) -> _Span:
+def _worst_frame(positions: Array, first: int, last: int) -> _Span:
     """Find the frame with the largest interpolation error between two keyframes."""
-    start, end = position[first].astype(np.float64), position[last].astype(np.float64)
+    start, end = positions[first].astype(np.float64), positions[last].astype(np.float64)
     worst = _Span(0.0, first, first, last)
     for frame in range(first + 1, last):
         fraction = (frame - first) / (last - first)
-        error = position[frame] - (start + fraction * (end - start))
+        error = positions[frame] - (start + fraction * (end - start))
         worst = min(worst, _Span(-float(np.linalg.norm(error, axis=-1).max()), frame, first, last))
     return worst
 
 
 class Glb:
-    """Content of a .glb file with a scene.
-
-    Attributes:
-        document: the JSON document, without its buffers.
-    """
+    """Content of a .glb file with a scene; `document` is the JSON document, without its buffers."""
 
     def __init__(self, document: dict[str, Any]) -> None:
         self.document = document
@@ -234,15 +221,7 @@ class Glb:
         self._length = 0
 
     def view(self, data: bytes | memoryview, target: int | None = None) -> int:
-        """Append bytes.
-
-        Args:
-            data: content of the view.
-            target: GL_ARRAY_BUFFER or GL_ELEMENT_ARRAY_BUFFER; None for other data.
-
-        Returns:
-            Index of the buffer view.
-        """
+        """Append bytes, and return the index of their view; `target` is GL_ARRAY_BUFFER or GL_ELEMENT_ARRAY_BUFFER."""
         view = {"buffer": 0, "byteOffset": self._length, "byteLength": len(data)}
         self._views.append(view if target is None else {**view, "target": target})
         padding = _padding(len(data), b"\0")
@@ -251,15 +230,9 @@ class Glb:
         return len(self._views) - 1
 
     def accessor(self, values: Numbers, target: int | None = None, *, bounds: bool = False) -> int:
-        """Append numbers.
+        """Append floats, stored as float32, or integers, as uint32, shape (n,) or (n, k), k = 1 to 4.
 
-        Args:
-            values: floats, stored as float32, or integers, as uint32, shape (n,) or (n, k), k = 1 to 4.
-            target: as for `view`.
-            bounds: whether to store the minimum and maximum.
-
-        Returns:
-            Index of the accessor.
+        With `bounds`, the minimum and maximum are stored, too. Return the index of the accessor.
         """
         dtype = np.float32 if values.dtype.kind == "f" else np.uint32
         rows = np.ascontiguousarray(values, dtype).reshape(len(values), -1)
@@ -275,14 +248,9 @@ class Glb:
         return len(self._accessors) - 1
 
     def attributes(self, positions: Numbers, normals: Numbers) -> dict[str, int]:
-        """Append the attributes of a mesh or a morph target.
+        """Append positions [m] and unit normals of vertices, or their differences, shape (vertices, 3).
 
-        Args:
-            positions: positions of the vertices, or their differences [m], shape (vertices, 3).
-            normals: unit normals, or their differences, shape (vertices, 3).
-
-        Returns:
-            Indices of the accessors, by attribute.
+        Return the indices of the accessors, by attribute.
         """
         return {
             "POSITION": self.accessor(positions, GL_ARRAY_BUFFER, bounds=True),
@@ -294,26 +262,15 @@ class Glb:
         return self.accessor(triangles.reshape(-1), GL_ELEMENT_ARRAY_BUFFER)
 
     def add(self, kind: str, entry: dict[str, Any]) -> int:
-        """Append an entry to a list of the document.
-
-        Args:
-            kind: name of the list, such as "nodes".
-            entry: content of the entry.
-
-        Returns:
-            Index of the entry in the list.
-        """
+        """Append an entry to a list of the document, such as "nodes"; return its index."""
         self.document.setdefault(kind, []).append(entry)
         return len(self.document[kind]) - 1
 
     def animate(self, node: int, path: str, times: Numbers, values: Numbers) -> None:
-        """Append a channel of the animation, with linear interpolation.
+        """Append a channel of the animation, with linear interpolation between times [s], shape (n,).
 
-        Args:
-            node: index of the node.
-            path: property of the node: translation, rotation or weights.
-            times: times of the values [s], shape (n,).
-            values: values of the property in glTF's units, shape (n, k), or (n * targets,) of weights.
+        `path` is the property of the node: translation, rotation or weights. Its values are in glTF's units, shape (n,
+        k), or (n * targets,) of weights.
         """
         if "animations" not in self.document:
             self.add("animations", {"name": "motion", "samplers": [], "channels": []})

@@ -37,8 +37,7 @@ PICTURE_FILE = "picture.png"
 def picture_png(run: FinishedRun) -> bytes | None:
     """Encode the picture on the sheet, cropped to the scene's region, as PNG; None without a picture.
 
-    Raises:
-        SceneError: when the picture cannot be read or has changed since the run.
+    A picture that cannot be read or has changed since the run raises a SceneError.
     """
     if run.scene.image is None:
         return None
@@ -46,29 +45,17 @@ def picture_png(run: FinishedRun) -> bytes | None:
 
 
 def encode_picture(picture: NDArray[np.uint8] | NDArray[np.uint16], format: str, **options: int) -> bytes:  # noqa: A002
-    """Return the bytes of a picture file.
-
-    Args:
-        picture: grey values or colours, shape (height, width) or (height, width, 3).
-        format: format of Pillow, PNG or JPEG.
-        **options: Pillow's options of the format.
-    """
+    """Return the file of grey values or colours, shape (height, width) or (height, width, 3), in a format of Pillow."""
     file = io.BytesIO()
     Image.fromarray(picture).save(file, format, **options)
     return file.getvalue()
 
 
 def unit_normals(position: NDArray[np.floating]) -> NDArray[np.float64]:
-    """Compute the unit normals of the sheet, as used for shading.
+    """Compute the unit normals of the sheet, as used for shading, shape (rows * cols, 3).
 
-    Tangents are central differences, one-sided at edges. The normals of the flat sheet are z; a normal that
-    vanishes at a fold is replaced by z.
-
-    Args:
-        position: positions of the mass points [m], shape (rows, cols, 3).
-
-    Returns:
-        Unit normals, shape (rows * cols, 3).
+    Tangents are central differences, one-sided at edges. The normals of the flat sheet are z; a normal that vanishes at
+    a fold is replaced by z.
     """
     position = position.astype(np.float64)
     normal = np.cross(np.gradient(position, axis=1), -np.gradient(position, axis=0)).reshape(-1, 3)
@@ -77,11 +64,9 @@ def unit_normals(position: NDArray[np.floating]) -> NDArray[np.float64]:
 
 
 def read_tracks(run: FinishedRun) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
-    """Read the projected positions of the tracks and their occlusion.
+    """Read the projected positions of the tracks [px], shape (tracks, frames, 2), and whether they are occluded.
 
-    Returns:
-        Positions in the picture [px], shape (tracks, frames, 2), NaN behind the camera; and whether the track is
-        occluded, shape (tracks, frames), True behind the camera.
+    Behind the camera, positions are NaN and the track is occluded.
     """
     path = run.result_path("tracks")
     with reading(path), zipfile.ZipFile(path) as archive:
@@ -94,11 +79,9 @@ def read_tracks(run: FinishedRun) -> tuple[NDArray[np.float32], NDArray[np.bool_
 
 
 def read_track_positions(run: FinishedRun) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """Read the material points of the tracks and their positions in space.
+    """Read the material points of the tracks and their positions in space [m], shape (tracks, frames, 3).
 
-    Returns:
-        Coordinates on the sheet as fractions of its width and height, shape (tracks, 2); and positions [m], shape
-        (tracks, frames, 3).
+    The former are fractions of the sheet's width and height, shape (tracks, 2).
     """
     path = run.result_path("tracks")
     with reading(path), zipfile.ZipFile(path) as archive:
@@ -111,12 +94,7 @@ def read_track_positions(run: FinishedRun) -> tuple[NDArray[np.float32], NDArray
 
 
 def read_depth(run: FinishedRun, frame: int) -> NDArray[np.float32]:
-    """Return the depth along the optical axis [m], shape (height, width), 0 on the background.
-
-    Args:
-        run: run with depth, and its camera selected.
-        frame: index of the frame.
-    """
+    """Return the depth along the optical axis in a frame [m], shape (height, width), 0 on the background."""
     path = run.result_path("depth", frame)
     with reading(path), Image.open(path, formats=["TIFF"]) as image:
         # Checked before decoding, which could take any amount of memory.
@@ -129,25 +107,14 @@ def read_depth(run: FinishedRun, frame: int) -> NDArray[np.float32]:
 
 
 def read_flow(run: FinishedRun, pair: int) -> NDArray[np.float32]:
-    """Return the optical flow to the right and down [px], shape (height, width, 2).
-
-    Args:
-        run: run with flow, and its camera selected.
-        pair: index of the first of two adjacent frames.
-    """
+    """Return the flow to the right and down [px], shape (height, width, 2), from frame `pair` to the next one."""
     path = run.result_path("flow", pair)
     with reading(path):
         return read_flo(path, run.scene.render.size)
 
 
 def read_picture_file(run: FinishedRun, key: str, frame: int) -> bytes:
-    """Return the content of a picture file, which is decoded once for validation.
-
-    Args:
-        run: run with its camera selected.
-        key: entry of `output`, such as png.
-        frame: index of the frame.
-    """
+    """Return the content of a picture file of an entry of `output`, which is decoded once for validation."""
     run.read_picture(key, frame)
     path = run.result_path(key, frame)
     with reading(path):
@@ -176,15 +143,7 @@ class Pinhole(NamedTuple):
 def read_pinhole(run: FinishedRun, name: str) -> Pinhole:
     """Read camera.json for a format that requires a pinhole camera.
 
-    Args:
-        run: run with its camera selected.
-        name: name of the format, for messages.
-
-    Returns:
-        Intrinsics, and the pose of every frame.
-
-    Raises:
-        ArgumentError: when the camera is orthographic or has lens distortion.
+    An orthographic camera or one with lens distortion raises an ArgumentError.
     """
     path = run.directory / run.camera / CAMERA_FILE
     alternative = "choose another camera by --camera, or " if FORMATS[name].cameras == ANY_CAMERA else ""
@@ -211,13 +170,10 @@ def read_pinhole(run: FinishedRun, name: str) -> Pinhole:
     return Pinhole(focal, centre, poses)
 
 
-def instrument_mesh(
-    solid: Solid,
-) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.int32]]:
-    """Triangulate the surface of an instrument whose tip is at the origin.
+def instrument_mesh(solid: Solid) -> tuple[Array, Array, NDArray[np.int32]]:
+    """Triangulate the surface of an instrument whose tip is at the origin, counter-clockwise from outside.
 
-    Returns:
-        Vertices [m] and unit normals, shape (vertices, 3); triangles, counter-clockwise from outside, shape (n, 3).
+    Return vertices [m] and unit normals, shape (vertices, 3), and triangles, shape (n, 3).
     """
     axis = solid.axis
     across = np.cross(axis, np.eye(3)[np.abs(axis).argmin()])

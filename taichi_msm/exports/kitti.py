@@ -34,15 +34,7 @@ SOURCE_OUTPUTS = {"flow_occ": "flow", "flow_noc": "occlusion", "image_2": "png"}
 
 
 def write(sources: Sequence[ExportSource], folder: Path) -> Iterator[list[str]]:
-    """Write the flow of runs, with pictures and occlusion if available.
-
-    Args:
-        sources: runs to export.
-        folder: existing, empty folder of the export.
-
-    Yields:
-        Warnings about each run in turn.
-    """
+    """Write the flow of runs, with pictures and occlusion if available."""
     training, first = folder / "training", 0
     for name in SOURCE_OUTPUTS:
         (training / name).mkdir(parents=True)
@@ -76,14 +68,9 @@ def _write_run(run: FinishedRun, training: Path, first: int, progress: ProgressC
 
 
 def encode_flow(flow: NDArray[np.float32], visible: NDArray[np.bool_] | None = None) -> NDArray[np.uint16]:
-    """Encode flow as the colours of KITTI.
+    """Encode flow to the right and down [px] as the colours of KITTI, shape (height, width, 3).
 
-    Args:
-        flow: to the right and down [px], shape (height, width, 2).
-        visible: mask of valid pixels, shape (height, width); None for all.
-
-    Returns:
-        Colours, shape (height, width, 3); 0 where the flow is invalid or out of range.
+    They are 0 where the flow is out of range, and where `visible` is False.
     """
     # In f32, the sum would be rounded before `rint`.
     scaled = np.rint(flow.astype(np.float64) * 64.0 + 32768.0)

@@ -25,7 +25,6 @@ MATERIAL_FILE = "surface.mtl"
 
 
 def _write_run(run: FinishedRun, folder: Path, progress: ProgressCallback) -> list[str]:
-    """Write the surface of every frame, the material and the picture."""
     positions, picture = run.positions(), picture_png(run)
     if picture is not None:
         write_new_file(folder / PICTURE_FILE, picture)

@@ -49,7 +49,6 @@ except ImportError:
 
 
 def _write_run(run: FinishedRun, path: Path, progress: ProgressCallback) -> list[str]:
-    """Write a recording of a run."""
     # The viewer merges recordings with the same identity: here, those of the same folder.
     identity = uuid5(NAMESPACE_URL, run.directory.resolve().as_uri())
     with rerun.RecordingStream("taichi_msm", recording_id=identity) as recording:

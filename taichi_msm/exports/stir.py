@@ -52,7 +52,6 @@ Pixels = NDArray[np.int64]
 
 
 def _write_run(run: FinishedRun, folder: Path, progress: ProgressCallback) -> list[str]:
-    """Write the videos, marked tracks and cameras of a run."""
     if not outputs.is_pyav_installed():
         raise NotInstalledError(f"--format {outputs.PYAV_NOT_INSTALLED.replace('mp4', FORMAT_NAME, 1)}")
     runs = [replace(run, camera=side) for side in CAMERAS]
@@ -104,10 +103,9 @@ def _report_progress(progress: ProgressCallback, before: int, done: int, total: 
 
 
 def _choose_tracks(runs: Sequence[FinishedRun], radius: int) -> tuple[Pixels, int]:
-    """Choose the tracks to mark.
+    """Choose the tracks to mark; return their pixels and the number of all tracks.
 
-    Returns:
-        Pixels per camera in the first and last frame, shape (2, 2, tracks, 2); and the number of all tracks.
+    The pixels are those per camera in the first and last frame, shape (2, 2, tracks, 2).
     """
     tracks, occluded = (np.stack(each)[:, :, [0, -1]] for each in zip(*map(read_tracks, runs), strict=True))
     # From the axes camera, track, frame, component to camera, frame, track, component.

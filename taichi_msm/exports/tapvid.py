@@ -42,15 +42,7 @@ class _Pickler(pickle.Pickler):
 
 
 def write(sources: Sequence[ExportSource], folder: Path) -> Iterator[list[str]]:
-    """Write the tracks and frames of runs.
-
-    Args:
-        sources: runs to export.
-        folder: existing, empty folder of the export.
-
-    Yields:
-        Warnings about each run in turn.
-    """
+    """Write the tracks and frames of runs."""
     _require_memory([source.run for source in sources])
     videos = {}
     for run, name, progress in sources:

@@ -32,12 +32,8 @@ from taichi_msm.runs.finished import FinishedRun
 
 
 def _write_run(run: FinishedRun, path: Path, progress: ProgressCallback) -> list[str]:
-    """Write the tracks and frames of a run."""
-    camera, (pixels, occluded), (_, position) = (
-        read_pinhole(run, "tapvid3d"),
-        read_tracks(run),
-        read_track_positions(run),
-    )
+    camera, (pixels, occluded) = read_pinhole(run, "tapvid3d"), read_tracks(run)
+    _, position = read_track_positions(run)
     images = []
     for frame in range(run.frames):
         progress(frame, run.frames)

@@ -41,7 +41,6 @@ Array = NDArray[np.floating]
 
 
 def _write_run(run: FinishedRun, folder: Path, progress: ProgressCallback) -> list[str]:
-    """Write the surface of every frame, the collection and the picture."""
     positions, picture = run.positions(), picture_png(run)
     run.require_same_pictures(drawn=False)
     plan, rest = make_plan(run.scene), rest_positions(run.scene.sheet)
@@ -67,15 +66,10 @@ write = one_folder_per_run(_write_run)
 
 
 def speed(positions: Array, time: Array, frame: int) -> Array:
-    """Compute the speed of the mass points in a frame by central differences.
+    """Compute the speed of the mass points in a frame [m/s], shape (rows, cols), by central differences.
 
-    Args:
-        positions: positions in all frames [m], shape (frames, rows, cols, 3).
-        time: times of the frames [s], shape (frames,).
-        frame: index of the frame.
-
-    Returns:
-        Speed [m/s], shape (rows, cols); 0 in the first frame, in which the sheet is at rest.
+    It is 0 in the first frame, in which the sheet is at rest. The positions in all frames [m] have shape (frames, rows,
+    cols, 3).
 
     Order: 2 in the frame interval; 1 in the last frame and where the load jumps.
     """

@@ -1,10 +1,10 @@
 """Chain rule from the coefficients of a sheet to the numbers of its scene.
 
 Closed forms lead from the scene to a `Material` (`derive` of every term), and on to the coefficients of a time step
-(`verlet.coefficients`). Complex steps differentiate them, exactly but for rounding: f(x + i h) is f(x) + i h f'(x) with
-an h so small that its square vanishes. Loads are linear in their percents and in the components of the force, control
-points in their keyframes. The derivative with respect to one of these values therefore follows from a schedule with 1
-for this value and 0 for all others.
+(`Plan.step_coefficients`). Complex steps differentiate them, exactly but for rounding: f(x + i h) is f(x) + i h f'(x)
+with an h so small that its square vanishes. Loads are linear in their percents and in the components of the force,
+control points in their keyframes. The derivative with respect to one of these values therefore follows from a schedule
+with 1 for this value and 0 for all others.
 """
 
 from __future__ import annotations
@@ -22,7 +22,6 @@ from taichi_msm.laws import law_of
 from taichi_msm.model.loads import Schedule
 from taichi_msm.model.plan import Plan, ProbeSegment
 from taichi_msm.model.tool_force import control_points
-from taichi_msm.model.verlet import coefficients
 from taichi_msm.scene.scene import Scene
 from taichi_msm.scene.section import Section
 from taichi_msm.scene.sheet import Foundation
@@ -80,16 +79,7 @@ class Derivatives:
 
 
 def scene_derivatives(plan: Plan, gradient: SheetGradient, loads: LoadGradient) -> Derivatives:
-    """Apply the chain rule to the derivatives with respect to the coefficients and the loads of a sheet.
-
-    Args:
-        plan: plan of the differentiated run, with a stiffness map.
-        gradient: derivatives with respect to the coefficients of the sheet.
-        loads: derivatives with respect to the loads, already by the keys of the scene.
-
-    Returns:
-        Derivatives with respect to the numbers and maps of the scene.
-    """
+    """Apply the chain rule to derivatives by the coefficients and the loads of a sheet with a stiffness map."""
     material, kind = plan.material, plan.scene.kind
     assert material.factors is not None
     by_coefficient = _coefficient_gradient(plan, gradient)
@@ -108,7 +98,7 @@ def _sheet_coefficients(plan: Plan, scene: Scene) -> NDArray[Any]:
     """Return the coefficients of a sheet, real or complex, in the order of `_coefficient_gradient`."""
     material = derive_material(scene, {})
     springs = [material.across, material.down, material.shear, material.tension]
-    steps = () if scene.time.at_rest else coefficients(replace(plan, scene=scene, material=material))
+    steps = () if scene.time.at_rest else replace(plan, scene=scene, material=material).step_coefficients
     laws = (law for law in (material.stiffening, material.virtual_stiffening) if law)
     of_laws = [number for law in laws for number in (law.scale, *law.shape)]
     return np.array([*springs, material.virtual, material.bending, *of_laws, *steps])
@@ -136,7 +126,7 @@ def _coefficient_gradient(plan: Plan, gradient: SheetGradient) -> Array:
         if law:
             derivatives += [_from_logarithm(by_numbers[0], law.scale), *by_numbers[1 : 1 + law.law.shape_count]]
     if not plan.scene.time.at_rest:
-        _, gain, first_gain = coefficients(plan)
+        _, gain, first_gain = plan.step_coefficients
         derivatives += [gradient.keep, gradient.gain / gain, gradient.first_gain / first_gain]
     return np.array(derivatives)
 
@@ -164,17 +154,10 @@ def _material_numbers(scene: Scene) -> Iterator[tuple[str, float]]:
     if tissue is None:
         static, dynamic = ["springs.structural", "springs.shear", "springs.virtual"], ["sheet.mass", "damping"]
     else:
-        foundation = ["foundation"]
+        foundation, laws = ["foundation"], _law_keys("stiffening", tissue.stiffening)
         if isinstance(tissue.foundation, Foundation):
             foundation = ["foundation.young", "foundation.depth", *_law_keys("foundation", tissue.foundation)]
-        names = [
-            "young",
-            "thickness",
-            *foundation,
-            "pretension",
-            "bending",
-            *_law_keys("stiffening", tissue.stiffening),
-        ]
+        names = ["young", "thickness", *foundation, "pretension", "bending", *laws]
         static, dynamic = [f"tissue.{name}" for name in names], ["tissue.density", "tissue.damping"]
     for key in static if scene.time.at_rest else static + dynamic:
         value = attrgetter(key)(scene)
@@ -197,11 +180,7 @@ def _with_value(section: Any, key: str, value: complex) -> Any:
 
 
 class LoadGradient:
-    """Derivatives with respect to the loads, accumulated over blocks of steps.
-
-    Attributes:
-        by_key: derivatives by key, as in `Derivatives.numbers`.
-    """
+    """Derivatives with respect to the loads, by the keys of `Derivatives.numbers`, accumulated over blocks of steps."""
 
     def __init__(self, plan: Plan) -> None:
         self._plan = plan
@@ -217,13 +196,10 @@ class LoadGradient:
             self.by_key[f"probes.{index}.at"] = np.zeros((*np.shape(probe.at)[:-1], 2))
 
     def add(self, schedule_of: Callable[[Plan], Schedule], by_slot: Array, times: tuple[float, float]) -> None:
-        """Add the derivatives of a block of steps.
+        """Add the derivatives of a block of steps, whose loads are in a time interval [s].
 
-        Args:
-            schedule_of: function from a plan with other loads to the schedule of these steps.
-            by_slot: derivatives with respect to the force (3) and the control point (2) of every slot, shape (steps,
-                slots, 5).
-            times: time interval of the block's loads [s]; only the keyframes that affect it are evaluated.
+        `schedule_of` returns the schedule of these steps for a plan with other loads. `by_slot` are the derivatives
+        with respect to the force (3) and the control point (2) of every slot, shape (steps, slots, 5).
         """
         height, width = self._plan.scene.sheet.size
         for index, slots in self._slots.items():

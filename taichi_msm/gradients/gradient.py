@@ -29,11 +29,7 @@ Array = NDArray[np.float64]
 
 
 def require_differentiable(plan: Plan) -> None:
-    """Require that a scene has a gradient.
-
-    Raises:
-        SceneError: when it has position-controlled tools, or another term without a gradient.
-    """
+    """Raise a SceneError if a scene has a position-controlled tool or another term without a gradient."""
     for tool in plan.tools:
         reason = "a tool with a path has no gradient, as its contact begins and ends"
         remedy = "fit numbers instead of a map, or take finite differences"
@@ -69,13 +65,7 @@ def _require_memory(plan: Plan) -> None:
 class Adjoint:
     """Differentiable simulation in f64 on a CPU, compiled once for runs with several stiffness maps.
 
-    Args:
-        plan: plan of the scene.
-        device: device of the kernels, a CPU.
-        cores: number of CPU cores of a dynamic scene; None for all.
-
-    Raises:
-        SceneError: when a probe has a path, or the memory does not suffice.
+    A scene without a gradient, or too large for the memory, raises a SceneError.
     """
 
     def __init__(self, plan: Plan, device: Device, cores: int | None = None) -> None:
@@ -90,19 +80,11 @@ class Adjoint:
         self._ran = False
 
     def run(self, factors: Array | None = None, pause: Pause = lambda: None, scene: Scene | None = None) -> Array:
-        """Run the scene.
+        """Run the scene; return the positions at every frame [m], shape (F + 1, rows, cols, 3).
 
-        Args:
-            factors: stiffness factors of the cells, shape (rows - 1, cols - 1); None for those of the scene.
-            pause: called several times a second; an exception from it ends the run, without derivatives.
-            scene: the plan's scene with other forces of its probes; None for the plan's.
-
-        Returns:
-            Positions at every frame [m], shape (F + 1, rows, cols, 3).
-
-        Raises:
-            ArgumentError: when the factors are not positive numbers of that shape, or too large for the step.
-            DivergedError: when the simulation diverges.
+        `factors` are the stiffness factors of the cells, shape (rows - 1, cols - 1), and `scene` is the plan's with
+        other forces of its probes; None for those of the plan. Factors that are invalid, or too large for the step,
+        raise an ArgumentError. An exception from `pause` ends the run, without derivatives.
         """
         self._ran = False
         plan = self._plan if factors is None else self._with_factors(factors)
@@ -113,19 +95,9 @@ class Adjoint:
         return rest_positions(plan.scene.sheet) + displacements
 
     def backward(self, by_position: Array, pause: Pause = lambda: None) -> Derivatives:
-        """Differentiate a loss at the last `run`.
+        """Differentiate a loss at the last `run`, from its derivative by the positions, shape (F + 1, rows, cols, 3).
 
-        Args:
-            by_position: derivative of the loss with respect to the positions at every frame, shape (F + 1, rows, cols,
-                3).
-            pause: called several times a second; an exception from it ends the differentiation.
-
-        Returns:
-            Derivatives with respect to the numbers of the scene.
-
-        Raises:
-            ArgumentError: when `by_position` is not an array of finite numbers of that shape.
-            MsmError: when `run` has not been called.
+        A `by_position` that is not an array of finite numbers of that shape raises an ArgumentError.
         """
         if not self._ran:
             raise MsmError("no run to differentiate; call run first")

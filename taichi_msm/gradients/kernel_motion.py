@@ -179,12 +179,7 @@ def _build_store_moments(code: KernelConfig) -> list[Callable[..., None]]:
 def build_store(code: KernelConfig, *, parallel: bool) -> Callable[..., None]:
     """Build the kernel that steps forward and stores all displacements.
 
-    Args:
-        code: terms and number types of the kernel.
-        parallel: whether the workers run in parallel; otherwise one thread runs the steps of all workers in turn.
-
-    Returns:
-        The kernel `store`.
+    Unless `parallel`, a single thread runs the steps of all workers in turn.
     """
     real, vector, vectors = code.real, code.vector, code.vectors
     count_of_numbers, fill_halo, step = code.first_constant(None), build_fill_halo(code), build_point_step(code)
@@ -232,15 +227,11 @@ def build_store(code: KernelConfig, *, parallel: bool) -> Callable[..., None]:
         d_x: vectors, d_y: vectors, d_z: vectors,
         constants_of: ti.types.ndarray(dtype=vector, ndim=1), by_column: vectors, fields: vectors,
     ):  # fmt: skip
-        """Step forward.
+        """Step forward from the first of the displacements `u` of all steps [m].
 
-        Args:
-            sizes: sizes of the launch, with indices from `COUNT` on, shape (11,).
-            progress: steps finished by each worker, at multiples of `STRIDE`, shape (STRIDE workers,).
-            loads: loads of every step, as in `Dynamics.step_table`, shape (steps, columns).
-            u_x, u_y, u_z: displacements of all steps [m], then the workers' moments and carried forces.
-            d_x, d_y, d_z: last differences of the displacements [m], updated.
-            constants_of, by_column, fields: arrays of the sheet, see `KernelSheet`.
+        After them, `u` has the workers' moments and carried forces. `d` are the last differences [m]. The elements of
+        `sizes` have the indices from `COUNT` on; `progress` is the number of steps that each worker has finished, at
+        multiples of `STRIDE`; `loads` is a `Dynamics.step_table`.
         """
         ti.loop_config(serialize=not parallel)
         for index in range(ti.cast(sizes[WORKERS], ti.i32) * ITERATIONS_PER_THREAD):
@@ -405,15 +396,7 @@ def _build_sweep_row(code: KernelConfig) -> Callable[..., None]:
 
 @cache
 def build_sweep(code: KernelConfig, *, parallel: bool) -> Callable[..., None]:
-    """Build the kernel that sweeps the adjoint, from the last step to the first.
-
-    Args:
-        code: terms and number types of the kernel.
-        parallel: whether the workers run in parallel; otherwise one thread runs the steps of all workers in turn.
-
-    Returns:
-        The kernel `sweep`.
-    """
+    """Build the kernel that sweeps the adjoint, from the last step to the first; `parallel` as in `build_store`."""
     real, vector, vectors, count_of_numbers = code.real, code.vector, code.vectors, code.first_constant(None)
     fill_halo, storing = build_fill_halo(code), _build_store_moments(code)
     sweep_row = _build_sweep_row(code)
@@ -453,16 +436,11 @@ def build_sweep(code: KernelConfig, *, parallel: bool) -> Callable[..., None]:
         constants_of: ti.types.ndarray(dtype=vector, ndim=1),
         by_column: vectors, fields: vectors, derivatives: vectors,
     ):  # fmt: skip
-        """Sweep backward.
+        """Sweep backward over the displacements `u` of all steps of a segment [m].
 
-        Args:
-            sizes, progress, loads: as in `store`, with the loads of the swept steps.
-            by_load: derivatives with respect to the loads, added up over a row, shape (steps, rows, slots x 5),
-                overwritten.
-            p_x, p_y, p_z: adjoint state, see `BUFFERS`, then the workers' moments and carried forces; updated.
-            u_x, u_y, u_z: displacements of all steps of the segment [m].
-            constants_of, by_column, fields: arrays of the sheet, see `KernelSheet`.
-            derivatives: accumulated derivatives, see `SPRING_PARTS`; updated.
+        `sizes`, `progress` and `loads`, of the swept steps, are as in `store`. `by_load` receives the derivatives with
+        respect to the loads, added up over a row, shape (steps, rows, slots x 5). `p` is the adjoint state, see
+        `BUFFERS`, then the workers' moments and carried forces. For `derivatives`, see `SPRING_PARTS`.
         """
         ti.loop_config(serialize=not parallel)
         for index in range(ti.cast(sizes[WORKERS], ti.i32) * ITERATIONS_PER_THREAD):
@@ -479,7 +457,7 @@ def build_sweep(code: KernelConfig, *, parallel: bool) -> Callable[..., None]:
 
 @cache
 def build_copy(code: KernelConfig) -> Callable[..., None]:
-    """Build the kernel that copies a range of entries from three arrays to three others."""
+    """Build the kernel that copies three arrays."""
     vectors = code.vectors
 
     @ti.kernel
@@ -488,14 +466,7 @@ def build_copy(code: KernelConfig) -> Callable[..., None]:
         from_x: vectors, from_y: vectors, from_z: vectors,
         to_x: vectors, to_y: vectors, to_z: vectors,
     ):  # fmt: skip
-        """Copy three arrays.
-
-        Args:
-            entries: number of entries.
-            source, target: first entry to read, and to write.
-            from_x, from_y, from_z: arrays to read.
-            to_x, to_y, to_z: arrays to write.
-        """
+        """Copy entries of three arrays, from `source` on, to three others, from `target` on."""
         ti.loop_config(serialize=True)
         for n in range(entries):
             for a, b in ti.static(((from_x, to_x), (from_y, to_y), (from_z, to_z))):

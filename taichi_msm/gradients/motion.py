@@ -21,7 +21,6 @@ from taichi_msm.gradients import kernel_motion as kernels
 from taichi_msm.gradients.chain_rule import LoadGradient, SheetGradient
 from taichi_msm.model.loads import average_loads
 from taichi_msm.model.plan import Plan
-from taichi_msm.model.verlet import coefficients
 from taichi_msm.solver.arrays import SheetLayout, from_lanes, to_lanes
 from taichi_msm.solver.backoff import Backoff
 from taichi_msm.solver.bands import MOMENT_ROWS
@@ -60,14 +59,7 @@ def motion_bytes(plan: Plan) -> int:
 
 
 class MotionAdjoint:
-    """Adjoint of a dynamic sheet.
-
-    Args:
-        plan: plan in f64 with a stiffness map.
-        device: device of the kernels, a CPU.
-        layout: memory layout and kernels; None to choose them for the plan.
-        cores: number of CPU cores; None for all.
-    """
+    """Adjoint of a dynamic sheet on a CPU; its plan is in f64 with a stiffness map."""
 
     def __init__(self, plan: Plan, device: Device, layout: SheetLayout | None = None, cores: int | None = None) -> None:
         self._forward = Dynamics(plan, device, layout, cores)
@@ -127,14 +119,7 @@ class MotionAdjoint:
     def run(self, pause: Pause = lambda: None) -> Array:
         """Run all steps and store the checkpoints.
 
-        Args:
-            pause: called several times a second; an exception from it ends the run.
-
-        Returns:
-            Displacements at every frame [m], shape (F + 1, rows, cols, 3).
-
-        Raises:
-            DivergedError: when the sheet diverges.
+        Return the displacements at every frame [m], shape (F + 1, rows, cols, 3).
         """
         plan, grid = self.plan, self.plan.grid
         monitor, frames = DivergenceMonitor(plan), np.zeros((grid.frames + 1, *plan.scene.sheet.points, 3))
@@ -153,18 +138,13 @@ class MotionAdjoint:
         return frames
 
     def backward(self, by_frame: Array, pause: Pause = lambda: None) -> tuple[SheetGradient, LoadGradient]:
-        """Sweep the adjoint of the last `run` backward in time.
+        """Sweep the adjoint of the last `run` backward in time; `pause` is called after every launch.
 
-        Args:
-            by_frame: derivative of the loss with respect to the displacements at every frame, shape (F + 1, rows, cols,
-                3).
-            pause: called after every launch; an exception from it ends the sweep.
-
-        Returns:
-            Derivatives with respect to the coefficients of the sheet, and to its loads.
+        `by_frame` is the derivative of the loss with respect to the displacements at every frame, as `run` returns
+        them.
         """
         grid, layout = self.plan.grid, self.layout
-        _, gain, _ = coefficients(self.plan)
+        gain = self.plan.step_coefficients.gain
         start = gain * self.plan.mobility[..., None] * by_frame[-1]
         for c in range(3):
             # p, an empty buffer, and q.
@@ -182,8 +162,7 @@ class MotionAdjoint:
     def _sweep_block(self, first: int, end: int, by_frame: Array, loads: LoadGradient, pause: Pause) -> Array:
         """Sweep backward over a block of segments.
 
-        Returns:
-            Work of the loads, the sum of p . force, over all steps but step 0, and in step 0, shape (2,).
+        Return the work of the loads, the sum of p . force, over all steps but step 0, and in step 0, shape (2,).
         """
         table, h = self._forward.step_table(first, end - first), self.plan.grid.step
         by_slot = np.zeros((end - first, len(self.plan.slots), kernels.LOAD_DERIVATIVES))
@@ -198,7 +177,7 @@ class MotionAdjoint:
                 pause()
         if first == 0:
             # The first step has another gain.
-            by_slot[0] *= table[0, GAIN] / coefficients(self.plan)[1]
+            by_slot[0] *= table[0, GAIN] / self.plan.step_coefficients.gain
         if not self.plan.slots:
             return np.zeros(2)
         loads.add(lambda plan: average_loads(plan, first, end - first), by_slot, (first * h - h, end * h))
@@ -226,18 +205,12 @@ class MotionAdjoint:
         checkpoint = first // self._segment * self._step_entries
         self._copy_step(checkpoint, 0, self._checkpoints, self._history)
         self._copy_step(checkpoint, 0, self._checkpoint_differences, self._differences)
+        arrays = *self._history, *self._differences, *self._sheet_arrays
         max_steps = self._max_launch_steps()
         for done in range(0, count, max_steps):
             steps = min(max_steps, count - done)
             sizes = self._sizes(steps, done, self._segment * layout.rows)
-            self._launch(
-                kernels.build_store,
-                sizes,
-                table[done : done + steps],
-                *self._history,
-                *self._differences,
-                *self._sheet_arrays,
-            )
+            self._launch(kernels.build_store, sizes, table[done : done + steps], *arrays)
             pause()
 
     def _launch_begin(self, first: int, end: int) -> int:
@@ -248,8 +221,7 @@ class MotionAdjoint:
     def _sweep(self, first: int, end: int, by_frame: Array, table: Array) -> Array:
         """Sweep backward from step `end` over the steps of a table of loads, within the segment that begins at `first`.
 
-        Returns:
-            Derivatives with respect to the loads, shape (steps, slots, 5).
+        Return the derivatives with respect to the loads, shape (steps, slots, 5).
         """
         layout, grid, count = self.layout, self.plan.grid, len(table)
         frame, steps_after_frame = divmod(end - count, grid.steps_per_frame)
@@ -260,16 +232,8 @@ class MotionAdjoint:
         sizes = self._sizes(count, end - first - 1, moment_row, buffer=self._buffer, with_loss=with_loss)
         columns = kernels.LOAD_DERIVATIVES * len(self.plan.slots)
         by_row = np.zeros((count, layout.rows, max(1, columns)))
-        self._launch(
-            kernels.build_sweep,
-            sizes,
-            table,
-            by_row,
-            *self._adjoint,
-            *self._history,
-            *self._sheet_arrays,
-            self._derivatives,
-        )
+        arrays = *self._adjoint, *self._history, *self._sheet_arrays, self._derivatives
+        self._launch(kernels.build_sweep, sizes, table, by_row, *arrays)
         self._buffer = (self._buffer + count) % 2
         return by_row[..., :columns].sum(axis=1).reshape(count, -1, kernels.LOAD_DERIVATIVES)
 

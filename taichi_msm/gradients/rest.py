@@ -36,12 +36,7 @@ RESIDUAL_TOLERANCE = 1e-6
 
 
 class RestAdjoint:
-    """Adjoint of a quasi-static sheet.
-
-    Args:
-        plan: plan in f64 with a stiffness map.
-        device: device of the kernels, a CPU.
-    """
+    """Adjoint of a quasi-static sheet on a CPU; its plan is in f64 with a stiffness map."""
 
     def __init__(self, plan: Plan, device: Device) -> None:
         self._forward = QuasiStatics(plan, device)
@@ -56,17 +51,7 @@ class RestAdjoint:
         return self._forward.plan
 
     def run(self, pause: Pause) -> Array:
-        """Solve all frames.
-
-        Args:
-            pause: called several times a second; an exception from it ends the solution.
-
-        Returns:
-            Displacements at every frame [m], shape (F + 1, rows, cols, 3).
-
-        Raises:
-            DivergedError: when a frame has no equilibrium.
-        """
+        """Solve all frames; return the displacements at every frame [m], shape (F + 1, rows, cols, 3)."""
         frames = []
         for n in range(self.plan.grid.frames + 1):
             self._forward.advance(int(n > 0), pause)
@@ -75,18 +60,10 @@ class RestAdjoint:
         return self._displacements.copy()
 
     def backward(self, by_frame: Array, pause: Pause) -> tuple[SheetGradient, LoadGradient]:
-        """Differentiate a loss at the last `run`.
+        """Differentiate a loss at the last `run`; raise an MsmError if the tangent stiffness is singular.
 
-        Args:
-            by_frame: derivative of the loss with respect to the displacements at every frame, shape (F + 1, rows, cols,
-                3).
-            pause: called several times a second; an exception from it ends the differentiation.
-
-        Returns:
-            Derivatives with respect to the coefficients of the sheet, and to its loads.
-
-        Raises:
-            MsmError: when the tangent stiffness is singular.
+        `by_frame` is the derivative of the loss with respect to the displacements at every frame, as `run` returns
+        them.
         """
         plan, (rows, cols) = self.plan, self.plan.scene.sheet.points
         families, laplacian = list(spring_families(plan)), _laplacian(plan)

@@ -22,6 +22,7 @@ class LawKey(NamedTuple):
     """A number of a law other than its scale: a key of the scene."""
 
     meaning: str  # for users
+    expected: str  # for error messages
     least: float
     most: float
     default: float

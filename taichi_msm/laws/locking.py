@@ -20,7 +20,9 @@ class Locking(Law):
     """Law of `lock` and `factor`."""
 
     scale: ClassVar[str] = "lock"
-    keys: ClassVar[dict[str, LawKey]] = {"factor": LawKey("largest stiffness, relative to that at rest", 1, 1000, 10)}
+    keys: ClassVar[dict[str, LawKey]] = {
+        "factor": LawKey("largest stiffness, relative to that at rest", "a number from 1 to 1000", 1.0, 1000.0, 10.0)
+    }
     shape_count: ClassVar[int] = 1
 
     def shape(self, *numbers: Any) -> tuple[Any, ...]:

@@ -9,6 +9,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from taichi_msm.integrators import Coefficients
 from taichi_msm.model.sheet import Maps, Material, has_fixed_border, point_areas
 from taichi_msm.model.time_grid import TimeGrid
 from taichi_msm.model.tool_force import control_points
@@ -129,6 +130,17 @@ class Plan:
     def has_contact(self) -> bool:
         """Whether mass points can meet and leave a tool."""
         return bool(touching_tools(self.tools))
+
+    @property
+    def step_coefficients(self) -> Coefficients:
+        """Coefficients of the steps."""
+        material = self.material
+        return self.scene.time.integrator.coefficients(material.mass, material.drag, self.grid.step)
+
+    @property
+    def convergence_order(self) -> int:
+        """Order of the steps: that of the integrator, but 1 with contact."""
+        return 1 if self.has_contact else self.scene.time.integrator.order(self.material.drag)
 
     def with_grid(self, **changes: Any) -> Plan:
         """Return a copy with other attributes of the time grid, such as `steps_per_frame` or `precision`."""

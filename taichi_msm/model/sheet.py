@@ -22,6 +22,7 @@ from taichi_msm.laws.law import LawNumbers
 from taichi_msm.scene.scene import Scene
 from taichi_msm.scene.section import MAX_POINTS, Side
 from taichi_msm.scene.sheet import Sheet, StiffnessMap
+from taichi_msm.system.array_cache import cached_arrays
 
 # Largest number of branches of the stress relaxation.
 MAX_BRANCHES = 4
@@ -149,7 +150,8 @@ def read_map(stiffness_map: StiffnessMap) -> MapImage:
         PictureError: when the file is missing, unreadable or not a grey image.
     """
     sha256 = file_sha256(stiffness_map.image)
-    return MapImage(read_grey(stiffness_map.image, sha256), sha256)
+    (grey,) = cached_arrays(("map", sha256), lambda: (read_grey(stiffness_map.image, sha256),))
+    return MapImage(grey, sha256)
 
 
 def cell_factors(stiffness_map: StiffnessMap, image: MapImage, sheet: Sheet) -> Array:

@@ -37,17 +37,11 @@ class Bins(NamedTuple):
 
 
 def build_bins(launches: Launches, bounds: Any, cells: int, extent: tuple[int, int], size: int) -> Bins:
-    """Build the bins of a picture: sequentially on a CPU, in parallel on a GPU.
+    """Build the bins of a picture from bounding boxes as stored by `store_bounds`, on the device.
 
-    Args:
-        launches: launches on the device; if `bounded`, as on a GPU, the kernels are parallel.
-        bounds: bounding boxes as stored by `store_bounds`, on the device, shape (cells * BOUNDS_STRIDE,).
-        cells: number of cells.
-        extent: width and height of the picture, in the unit of the bounds.
-        size: width and height of a bin; doubled while the lists have more than `MAX_MEAN_ENTRIES` per cell and bin.
-
-    Returns:
-        The lists of the cells that overlap each bin.
+    `extent`, the width and height of the picture, and `size`, those of a bin, are in the unit of the bounds. The size
+    is doubled while the lists have more than `MAX_MEAN_ENTRIES` per cell and bin. On a GPU (`launches.bounded`) the
+    bins are built in parallel.
     """
     corners = launches.download(bounds).reshape(cells, 2, 2)
     while True:
@@ -78,18 +72,7 @@ def build_bins(launches: Launches, bounds: Any, cells: int, extent: tuple[int, i
 
 @ti.func
 def store_bounds(cell, left, right, top, bottom, width, height, bounds: ti.template()):
-    """Store the bounding box of a cell, clipped to the picture; all lengths in [px] or all in [samples].
-
-    Args:
-        cell: index of the cell.
-        left: least x of the cell.
-        right: largest x.
-        top: least y.
-        bottom: largest y.
-        width: width of the picture.
-        height: height of the picture.
-        bounds: bounding boxes, shape (cells * BOUNDS_STRIDE,), written.
-    """
+    """Store the bounding box of a cell, clipped to the picture; all lengths in [px] or all in [samples]."""
     entry = cell * BOUNDS_STRIDE
     bounds[entry + FIRST_X] = ti.cast(ti.floor(ti.math.clamp(left, 0.0, MAX_BOUND)), ti.i32)
     bounds[entry + FIRST_Y] = ti.cast(ti.floor(ti.math.clamp(top, 0.0, MAX_BOUND)), ti.i32)
@@ -99,14 +82,7 @@ def store_bounds(cell, left, right, top, bottom, width, height, bounds: ti.templ
 
 @ti.func
 def is_in_bounds(cell, x, y, bounds: ti.template()):
-    """Return whether a sample is within the bounding box of a cell.
-
-    Args:
-        cell: index of the cell.
-        x: column of the sample.
-        y: row of the sample.
-        bounds: bounding boxes as stored by `store_bounds`.
-    """
+    """Return whether sample (x, y) is within the bounding box of a cell."""
     entry = cell * BOUNDS_STRIDE
     return (
         bounds[entry + FIRST_X] <= x
@@ -130,7 +106,6 @@ def _bin_range(cell, size, bounds: ti.template()):
 
 @ti.kernel
 def _count_cells(cells: ti.i32, size: ti.i32, columns: ti.i32, bounds: Integers, counts: Integers):
-    """Count the cells of every bin."""
     ti.loop_config(serialize=True)
     for cell in range(cells):
         left, right, top, bottom = _bin_range(cell, size, bounds)
@@ -153,13 +128,7 @@ def _list_cells(cells: ti.i32, size: ti.i32, columns: ti.i32, bounds: Integers, 
 
 @ti.func
 def owner_of(item, owners, ends: ti.template()):
-    """Return the index of the owner of an item, by binary search.
-
-    Args:
-        item: index of the item; the items of an owner are consecutive.
-        owners: number of owners.
-        ends: index after the last item of each owner, shape (owners,).
-    """
+    """Return the index of an item's owner, by binary search in `ends`: the index after the last item of each owner."""
     low, high = 0, owners - 1
     while low < high:
         middle = (low + high) // 2

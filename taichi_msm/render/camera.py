@@ -82,12 +82,7 @@ class View(NamedTuple):
         return self.distort(np.stack([x / w, y / w], axis=-1))
 
     def points(self, pixels: Array, depth: Array) -> Array:
-        """Return the points [m] at pixels, shape (n, 3).
-
-        Args:
-            pixels: undistorted pixels [px], shape (n, 2).
-            depth: depths [m], shape (n,).
-        """
+        """Return the points [m], shape (n, 3), at undistorted pixels [px], shape (n, 2), and depths [m], shape (n,)."""
         right, down = ((pixels - self.centre) / self.scale * (depth[:, None] if self.pinhole else 1.0)).T
         return self.eye + np.stack([right, -down, -depth], axis=-1) @ self.axes
 
@@ -122,13 +117,12 @@ class View(NamedTuple):
 def calibration(camera: View) -> dict[str, Any]:
     """Return the matrices of a camera in the conventions of other programs.
 
-    Returns:
-        "projection", 3 x 4: from the world to pixels without lens distortion, with the upper left corner at (0, 0).
+    "projection", 3 x 4: from the world to pixels without lens distortion, with the upper left corner at (0, 0).
 
-        For a pinhole camera also the following, in OpenCV's axes (x right, y down, z forward). "pose", 3 x 4: from the
-        world to the camera. "intrinsics", 3 x 3: from the camera to the same pixels. "calibration", 3 x 3: from the
-        camera to OpenCV's pixels, where the centre of the first pixel is (0, 0). "model" and "distortion": lens model
-        and its coefficients.
+    For a pinhole camera also the following, in OpenCV's axes (x right, y down, z forward). "pose", 3 x 4: from the
+    world to the camera. "intrinsics", 3 x 3: from the camera to the same pixels. "calibration", 3 x 3: from the camera
+    to OpenCV's pixels, where the centre of the first pixel is (0, 0). "model" and "distortion": lens model and its
+    coefficients.
     """
     projection = {"projection": camera.matrix[:3].tolist()}
     if not camera.pinhole:
@@ -150,28 +144,14 @@ def pose(camera: View) -> list[list[float]]:
 
 
 def view(scene: Scene, time: float = 0.0) -> View:
-    """Return the main camera of a scene at a time.
-
-    Args:
-        scene: scene with the cameras.
-        time: time [s].
-
-    Raises:
-        SceneError: when any camera of the scene is invalid.
-    """
+    """Return the main camera of a scene at a time [s]; raise a SceneError if any camera of the scene is invalid."""
     if problems := [str(problem) for problem in camera_problems(scene)]:
         raise SceneError(problems)
     return view_at(scene, time)
 
 
 def view_at(scene: Scene, time: float, name: str = "") -> View:
-    """Return the view of a valid camera of a scene at a time.
-
-    Args:
-        scene: scene with the cameras.
-        time: time [s].
-        name: name of the camera; by default the main camera.
-    """
+    """Return the view of a valid camera of a scene at a time [s]; by default of the main camera."""
     render = scene.render
     name = name or render.main
     result = _view_of(scene, time, name)
@@ -214,9 +194,8 @@ def _companion(camera: Camera, scene: Scene, reference: View) -> View:
 def pair_transform(camera: AnyCamera) -> dict[str, Any]:
     """Return the transform from a camera's reference camera to the camera, in the convention of stereoCalibrate.
 
-    Returns:
-        "beside": name of the reference camera; "rotation", 3 x 3, and "translation" [m] with X_this = R X_reference +
-        T, in OpenCV's axes. Empty without a reference camera.
+    "beside": name of the reference camera; "rotation", 3 x 3, and "translation" [m] with X_this = R X_reference + T, in
+    OpenCV's axes. Empty without a reference camera.
     """
     if not isinstance(camera, Camera) or camera.beside is None:
         return {}
@@ -227,12 +206,7 @@ def pair_transform(camera: AnyCamera) -> dict[str, Any]:
 
 
 def is_moving(scene: Scene, name: str = "") -> bool:
-    """Return whether a camera moves.
-
-    Args:
-        scene: scene with the cameras.
-        name: name of the camera; by default the main camera.
-    """
+    """Return whether a camera moves; by default the main camera."""
     camera, _ = scene.render.origin(name or scene.render.main)
     if isinstance(camera, Camera) and camera.beside is not None:
         return is_moving(scene, camera.beside)
@@ -378,13 +352,9 @@ def border_points(size: Array) -> Array:
 
 
 def pinhole(scene: Scene, time: float = 0.0) -> Camera:
-    """Return the main camera of a scene at a time as a static pinhole camera.
+    """Return the main camera of a scene at a time [s] as a static pinhole camera.
 
     An orthographic camera becomes a pinhole camera above the sheet, at the same scale.
-
-    Args:
-        scene: scene with the cameras.
-        time: time [s].
     """
     camera = scene.render.main_camera
     if isinstance(camera, Camera):
@@ -396,12 +366,7 @@ def pinhole(scene: Scene, time: float = 0.0) -> Camera:
 
 
 def frozen_camera(camera: Camera, time: float) -> Camera:
-    """Return a camera at a time as a static camera with eye, target and up.
-
-    Args:
-        camera: camera, possibly with keyframes or poses.
-        time: time [s].
-    """
+    """Return a camera at a time [s] as a static camera with eye, target and up."""
     if camera.pose is None and not camera.moves:
         return camera
     eye, axes, distance = extrinsics(camera, time)
@@ -412,13 +377,7 @@ def frozen_camera(camera: Camera, time: float) -> Camera:
 
 
 def orbit_camera(camera: Camera, right: float, up: float) -> Camera:
-    """Return a static camera rotated about its target.
-
-    Args:
-        camera: camera with a constant eye, target and up.
-        right: angle about the normal of the sheet [rad].
-        up: angle about the camera's horizontal axis [rad].
-    """
+    """Return a static camera turned about its target: `right` about the sheet's normal, `up` about its x axis [rad]."""
     eye, (across, _, toward), _ = extrinsics(camera, 0.0)
     rotation = _rotation(np.array([0.0, 0.0, 1.0]), right) @ _rotation(across, -up)
     new_eye = np.array(camera.target) + rotation @ np.subtract(eye, camera.target)
@@ -520,12 +479,7 @@ class Extrinsics(NamedTuple):
 
 
 def extrinsics(camera: Camera, time: float) -> Extrinsics:
-    """Return the extrinsics of a camera at a time.
-
-    Args:
-        camera: camera without a reference camera.
-        time: time [s].
-    """
+    """Return the extrinsics of a camera without a reference camera, at a time [s]."""
     if camera.pose is not None:
         rotation = _nearest_rotation(np.array(camera.pose.rotation))
         eye = -rotation.T @ np.array(camera.pose.translation)

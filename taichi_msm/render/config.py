@@ -191,15 +191,7 @@ class Band(NamedTuple):
 def read_arguments(
     uniforms: ti.template(), sizes: ti.template(), nodes: ti.template(), samples: ti.template(), config: ti.template()
 ):
-    """Return the arguments of a kernel as a `Band` without extent.
-
-    Args:
-        uniforms: constants of the view, as returned by `view_uniforms`.
-        sizes: sizes and counters, as returned by `sizes_of`.
-        nodes: projected mass points (`geometry.py`).
-        samples: G-buffer; with lens distortion also the undistortion map.
-        config: compile-time configuration.
-    """
+    """Return the arguments of a kernel as a `Band` without extent."""
     rows, cols, instrument_count = sizes[uni.ROWS], sizes[uni.COLS], sizes[uni.INSTRUMENT_COUNT]
     width, height = sizes[uni.WIDTH] * config.supersample, sizes[uni.HEIGHT] * config.supersample
     subdivisions, near = uniforms[uni.SUBDIVISIONS], uniforms[uni.NEAR]
@@ -214,50 +206,28 @@ def read_arguments(
 
 @ti.func
 def triple(array: ti.template(), first):
-    """Return three numbers of an array as a list.
-
-    Args:
-        array: array, shape (n,).
-        first: index of the first of the numbers.
-    """
+    """Return the three numbers of an array from index `first` on, as a list."""
     return [array[first + n] for n in ti.static(range(3))]
 
 
 @ti.func
 def dot(a: ti.template(), b: ti.template()):
-    """Return the scalar product of two vectors.
-
-    Args:
-        a: list of three components.
-        b: list of three components.
-    """
+    """Return the scalar product of two lists of three components."""
     return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
 
 
 @ti.func
 def cross(a: ti.template(), b: ti.template()):
-    """Return the vector product of two vectors, a list of three components.
-
-    Args:
-        a: list of three components.
-        b: list of three components.
-    """
+    """Return the vector product of two lists of three components, as a list."""
     return [a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]]
 
 
 @ti.func
 def clip(low_x, high_x, low_y, high_y, band: ti.template()):
-    """Clip a rectangle to a band.
+    """Clip a rectangle [samples] to a band.
 
-    Args:
-        low_x: left edge [samples].
-        high_x: right edge [samples].
-        low_y: upper edge [samples].
-        high_y: lower edge [samples].
-        band: band, whose edges are `left`, `right`, `top` and `bottom`.
-
-    Returns:
-        First column, column after the last one, first row, and row after the last one of the samples in the rectangle.
+    Return the first column, the column after the last one, the first row, and the row after the last one of its
+    samples.
     """
     return (
         ti.cast(ti.math.clamp(ti.floor(low_x), band.left, band.right), ti.i32),
@@ -269,19 +239,7 @@ def clip(low_x, high_x, low_y, high_y, band: ti.template()):
 
 @ti.func
 def tile_range(first_column, end_column, first_row, end_row, band: ti.template()):
-    """Return the tiles that a rectangle of samples overlaps.
-
-    Args:
-        first_column: first column of samples, as returned by `clip`.
-        end_column: column after the last one.
-        first_row: first row of samples.
-        end_row: row after the last one.
-        band: band, whose edges are `left`, `right`, `top` and `bottom`.
-
-    Returns:
-        First column of tiles, and the column after the last one; first row of tiles from the band's top, and the row
-        after the last one.
-    """
+    """Return the tiles that a rectangle of samples overlaps, as `clip`; their rows count from the band's top."""
     tile_width, tile_height = ti.static((band.config.tile_width, band.config.tile_height))
     return (
         first_column // tile_width,
@@ -293,13 +251,7 @@ def tile_range(first_column, end_column, first_row, end_row, band: ti.template()
 
 @ti.func
 def sample_centres(left, top, config: ti.template()):
-    """Return x and y of the sample centres of a tile [samples], one per lane.
-
-    Args:
-        left: first column of the tile [samples].
-        top: first row of the tile [samples].
-        config: compile-time configuration.
-    """
+    """Return x and y of the sample centres of a tile [samples], one per lane."""
     tile_width = ti.static(config.tile_width)
     columns = config.float_vector([lane % tile_width + 0.5 for lane in ti.static(range(config.lanes))])
     lines = config.float_vector([lane // tile_width + 0.5 for lane in ti.static(range(config.lanes))])
@@ -314,16 +266,7 @@ def _map_entry(entry, band: ti.template()):
 
 @ti.func
 def undistorted_centres(left, top, entry, band: ti.template()):
-    """Return the undistorted x and y of the sample centres of a tile [samples], one per lane.
-
-    Beyond the limit of the lens they are INVALID_COORDINATE.
-
-    Args:
-        left: first column of the tile [samples].
-        top: first row of the tile [samples].
-        entry: first entry of the tile in the G-buffer.
-        band: the band of the tile.
-    """
+    """Return the undistorted x and y of `sample_centres`; INVALID_COORDINATE beyond the limit of the lens."""
     x, y = sample_centres(left, top, band.config)
     if ti.static(band.config.has_distortion):
         stored = _map_entry(entry, band)
@@ -333,14 +276,7 @@ def undistorted_centres(left, top, entry, band: ti.template()):
 
 @ti.func
 def tile_box(entry, left, top, band: ti.template()):
-    """Return the bounding box of the undistorted sample centres of a tile: left, right, top and bottom [samples].
-
-    Args:
-        entry: first entry of the tile in the G-buffer.
-        left: first column of the tile [samples].
-        top: first row of the tile [samples].
-        band: the band of the tile.
-    """
+    """Return the bounding box of the undistorted sample centres of a tile: left, right, top and bottom [samples]."""
     config = ti.static(band.config)
     x, y = left + 0.5, top + 0.5
     box = [x, x + (config.tile_width - 1.0), y, y + (config.tile_height - 1.0)]
@@ -356,24 +292,14 @@ def tile_box(entry, left, top, band: ti.template()):
 
 @ti.func
 def map_steps(entry, band: ti.template()):
-    """Return the undistorted steps to the next samples [samples]: x and y of the right one, x and y of the lower one.
-
-    Args:
-        entry: first entry of the tile in the G-buffer.
-        band: the band of the tile.
-    """
+    """Return the undistorted steps to the next samples [samples]: x and y to the right, x and y to the one below."""
     steps_entry = _map_entry(entry, band) + 2
     return [band.samples[steps_entry + n] for n in ti.static(range(4))]
 
 
 @ti.func
 def clear_tile(entry, band: ti.template()):
-    """Mark the samples of a tile as empty.
-
-    Args:
-        entry: first entry of the tile in the G-buffer.
-        band: the band of the tile.
-    """
+    """Mark the samples of a tile as empty."""
     band.samples[entry + band.config.plane.depth] = band.config.float_vector(INFINITY)
     if ti.static(len(band.config.shapes) > 0):
         band.samples[entry + band.config.plane.instrument] = band.config.float_vector(0)
@@ -381,27 +307,13 @@ def clear_tile(entry, band: ti.template()):
 
 @ti.func
 def store_visible(entry, visible, value, samples: ti.template()):
-    """Store values of one plane for the visible samples of a tile.
-
-    Args:
-        entry: entry of the plane's vector in the G-buffer.
-        visible: mask of the samples, one per lane.
-        value: values, one per lane.
-        samples: G-buffer.
-    """
+    """Store values for the visible samples of a tile in the plane whose vector is at `entry`."""
     samples[entry] = ti.select(visible, value, samples[entry])
 
 
 @ti.func
 def store_visible_unit(entry, visible, vector: ti.template(), samples: ti.template()):
-    """Normalise vectors, and store them in three consecutive planes for the visible samples of a tile.
-
-    Args:
-        entry: entry of the first plane's vector in the G-buffer.
-        visible: mask of the samples, one per lane.
-        vector: list of three components, each with one number per lane.
-        samples: G-buffer.
-    """
+    """Normalise vectors, and store them for the visible samples of a tile in three planes from `entry` on."""
     length = ti.sqrt(dot(vector, vector))
     for n in ti.static(range(3)):
         store_visible(entry + n, visible, vector[n] / length, samples)

@@ -36,7 +36,8 @@ from taichi_msm.render.config import (
 from taichi_msm.render.lens_kernels import distorted_point
 from taichi_msm.render.undistortion import INVALID_COORDINATE
 from taichi_msm.shapes import SHAPES
-from taichi_msm.system.runtime import kernel_operations, ti
+from taichi_msm.system.kernel_operations import KERNEL
+from taichi_msm.system.runtime import ti
 
 
 class Cell(NamedTuple):
@@ -108,17 +109,7 @@ def _cover_tile(
 
 @ti.func
 def cover_cell(i, j, invertible, first, end, outline: ti.template(), band: ti.template()):
-    """Cover the samples of a band with a cell.
-
-    Args:
-        i: row of the cell.
-        j: column of the cell.
-        invertible: as in `Patch`.
-        first: first triangle that is drawn; 0 for an invertible cell.
-        end: triangle after the last one; 1 for an invertible cell.
-        outline: projected corners of the cell.
-        band: the band, whose G-buffer is updated.
-    """
+    """Cover the samples of a band with triangles `first` to `end` of a cell; 0 to 1 for an invertible cell."""
     config, float_vector = ti.static((band.config, band.config.float_vector))
     corner, normal_entry, distorted_entry = geometry.point_entries(i * band.cols + j, band)
     patch = ti.static(geometry.cell_patch(corner, band.cols, outline.facing, invertible, band.nodes, False))
@@ -201,23 +192,15 @@ def cover_cell(i, j, invertible, first, end, outline: ti.template(), band: ti.te
 @cache
 def _compile_ray(shape: str) -> Callable[..., Any]:
     """Return `Shape.build_ray` of a shape as a Taichi function."""
-    return ti.func(SHAPES[shape].build_ray(kernel_operations()))
+    return ti.func(SHAPES[shape].build_ray(KERNEL))
 
 
 @ti.func
 def intersect_instrument(x, y, index, uniforms: ti.template(), shapes: ti.template()):
-    """Intersect lines of sight with an instrument.
+    """Intersect lines of sight with an instrument; `shapes` are the names of the shapes of all instruments.
 
-    Args:
-        x: undistorted columns [samples].
-        y: undistorted rows [samples].
-        index: index of the instrument.
-        uniforms: constants of the view, as returned by `view_uniforms`.
-        shapes: names of the shapes of all instruments.
-
-    Returns:
-        Depth of the first intersection [m], INFINITY without one; three components of the outward normal there, in the
-        camera's frame and of any length.
+    Return the depth of the first intersection [m], INFINITY without one, and three components of the outward normal
+    there, in the camera's frame and of any length.
     """
     base = uni.INSTRUMENTS + index * uni.INSTRUMENT_STRIDE
     tip, axis = base + uni.TIP, base + uni.AXIS
@@ -249,7 +232,6 @@ def intersect_instrument(x, y, index, uniforms: ti.template(), shapes: ti.templa
 
 @ti.func
 def _cover_tile_with_instrument(entry, x, y, index, band: ti.template()):
-    """Cover a tile of samples with an instrument."""
     plane, samples = ti.static((band.config.plane, band.samples))
     depth, n_x, n_y, n_z = intersect_instrument(x, y, index, band.uniforms, band.config.shapes)
     visible = (geometry.w_at(depth, band.uniforms) > band.near) & (depth < samples[entry + plane.depth])
@@ -323,12 +305,6 @@ def store_point(position: ti.template(), i, j, band: ti.template()):
     """Store the projection of a mass point; as configured, also its distorted position and its normal.
 
     Normals for tissue are in the camera's frame, those for the headlight in the world's.
-
-    Args:
-        position: positions of the mass points [m], shape (rows, cols, 3).
-        i: row of the mass point.
-        j: column of the mass point.
-        band: the band, or the whole picture, whose `nodes` are written.
     """
     config = ti.static(band.config)
     geometry.project(position, i, j, band.cols, band.uniforms, band.nodes, False)

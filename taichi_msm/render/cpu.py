@@ -22,14 +22,7 @@ from taichi_msm.system.runtime import ITERATIONS_PER_THREAD, ti
 
 
 class Bands:
-    """Memory and kernel of one sheet's pictures on a CPU.
-
-    Args:
-        config: compile-time configuration.
-        shape: rows and columns of mass points.
-        size: width and height of the picture [px].
-        texels: levels of the texture, as returned by `pyramid`.
-    """
+    """Memory and kernel of pictures of `size` (width, height) [px] of a sheet of `shape` (rows, cols), on a CPU."""
 
     def __init__(
         self, config: DrawingConfig, shape: tuple[int, int], size: tuple[int, int], texels: NDArray[np.float32]
@@ -53,16 +46,7 @@ class Bands:
     def draw(
         self, position: NDArray[np.float32], uniforms: NDArray[np.float32], sizes: NDArray[np.int32]
     ) -> tuple[NDArray[np.uint8], NDArray[np.float32]]:
-        """Draw the picture, the labels or both, as configured.
-
-        Args:
-            position: positions of the mass points [m], shape (rows, cols, 3).
-            uniforms: constants of the view, as returned by `view_uniforms`.
-            sizes: sizes and counters, as returned by `sizes_of`.
-
-        Returns:
-            Colours, shape (height, width, 3), and values for `labels_of`; undefined unless configured.
-        """
+        """Return colours, shape (height, width, 3), and values for `labels_of`; undefined unless configured."""
         config, (width, height) = self._config, self._size
         # Tiles are written completely, and the last one of a row may extend beyond the picture.
         stride = config.tiles_across(width) * config.tile_width if config.writes_words else width
@@ -181,20 +165,7 @@ def _kernel(config: DrawingConfig) -> Callable[..., None]:
         sizes: Integers, nodes: Floats, samples: ti.types.ndarray(dtype=config.float_vector, ndim=1),
         colours: Integers if config.writes_words else Bytes, labels: Floats,
     ):  # fmt: skip
-        """Draw the picture, the labels or both, as configured.
-
-        Args:
-            position: positions of the mass points [m], shape (rows, cols, 3).
-            texels: levels of the texture, as returned by `pyramid`.
-            uniforms: constants of the view, as returned by `view_uniforms`.
-            workers: number of workers.
-            sizes: sizes and counters, as returned by `sizes_of`; the counters are 0 at the start.
-            nodes: projected mass points, then the rows that they overlap, written; shape
-                (rows * cols * POINT_STRIDE + 2 * rows,).
-            samples: undistortion map, then the G-buffer of a band for each worker, written.
-            colours: red, green and blue of all pixels, row by row, as words or bytes, written.
-            labels: all pixels of one label after the other, written.
-        """
+        """Draw the picture, the labels or both, as configured; the counters in `sizes` are 0 at the start."""
         for index in range(workers * ITERATIONS_PER_THREAD):
             if index % ITERATIONS_PER_THREAD == 0:
                 picture = ti.static(read_arguments(uniforms, sizes, nodes, samples, config))

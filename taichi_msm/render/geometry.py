@@ -69,17 +69,7 @@ class Triangle(NamedTuple):
 
 @ti.func
 def project(position: ti.template(), i, j, cols, uniforms: ti.template(), nodes: ti.template(), double: ti.template()):
-    """Project a mass point, and store its X, Y, w, depth, x and y.
-
-    Args:
-        position: positions of the mass points [m], shape (rows, cols, 3).
-        i: row of the mass point.
-        j: column of the mass point.
-        cols: number of columns of mass points.
-        uniforms: constants of the view, as returned by `view_uniforms`.
-        nodes: projected mass points, NODE_STRIDE numbers each, written.
-        double: whether `nodes` is f64; the order of the sum differs.
-    """
+    """Project a mass point, and store its X, Y, w, depth, x and y; for f64 (`double`), the sum has another order."""
     entry = (i * cols + j) * NODE_STRIDE
     x, y, z = position[i, j, 0], position[i, j, 1], position[i, j, 2]
     for n in ti.static(range(4)):
@@ -94,35 +84,19 @@ def project(position: ti.template(), i, j, cols, uniforms: ti.template(), nodes:
 
 @ti.func
 def w_at(depth, uniforms: ti.template()):
-    """Return w at a depth: for a pinhole camera the depth, otherwise 1.
-
-    Args:
-        depth: depth [m].
-        uniforms: constants of the view, as returned by `view_uniforms`.
-    """
+    """Return w at a depth [m]: for a pinhole camera the depth, otherwise 1."""
     return depth * uniforms[uni.PINHOLE] + (1.0 - uniforms[uni.PINHOLE])
 
 
 @ti.func
 def line_of_sight(x, y, uniforms: ti.template()):
-    """Return the components of lines of sight to the right and up, at w = 1 [m].
-
-    Args:
-        x: undistorted columns [samples].
-        y: undistorted rows [samples].
-        uniforms: constants of the view, as returned by `view_uniforms`.
-    """
+    """Return the components of lines of sight to the right and up, at w = 1 [m]."""
     return (x - uniforms[uni.CENTRE_X]) * uniforms[uni.SPREAD_X], (uniforms[uni.CENTRE_Y] - y) * uniforms[uni.SPREAD_Y]
 
 
 @ti.func
 def point_entries(point, band: ti.template()):
-    """Return the first entries of a mass point, of its normal and of its distorted position in `Band.nodes`.
-
-    Args:
-        point: index of the mass point, row by row.
-        band: the band, or the whole picture.
-    """
+    """Return the first entries of a mass point, of its normal and of its distorted position in `nodes`."""
     points = band.rows * band.cols
     return (
         point * NODE_STRIDE,
@@ -133,38 +107,20 @@ def point_entries(point, band: ti.template()):
 
 @ti.func
 def corner_entry(cell, cols):
-    """Return the first entry of a cell's upper left mass point in `nodes`.
-
-    Args:
-        cell: index of the cell, row by row.
-        cols: number of columns of mass points.
-    """
+    """Return the first entry of a cell's upper left mass point in `nodes`."""
     return (cell // (cols - 1) * cols + cell % (cols - 1)) * NODE_STRIDE
 
 
 @ti.func
 def corner_entries(first, cols, stride: ti.template()):
-    """Return the entries of the four corners of a cell.
-
-    Args:
-        first: entry of the upper left corner.
-        cols: number of columns of mass points.
-        stride: numbers per mass point.
-    """
+    """Return the entries of the corners of a cell from that of the upper left one, with `stride` per mass point."""
     below = first + cols * stride
     return ti.static((first, first + stride, below, below + stride))
 
 
 @ti.func
 def cell_outline(corner, cols, near, nodes: ti.template()):
-    """Return the `Outline` of a cell.
-
-    Args:
-        corner: first entry of the cell's upper left mass point in `nodes`.
-        cols: number of columns of mass points.
-        near: near plane [m].
-        nodes: projected mass points.
-    """
+    """Return the `Outline` of a cell."""
     corners = ti.static(corner_entries(corner, cols, NODE_STRIDE))
     x = [nodes[entry + SCREEN] for entry in corners]
     y = [nodes[entry + SCREEN + 1] for entry in corners]
@@ -194,16 +150,7 @@ def is_invertible(outline: ti.template()):
 
 @ti.func
 def cell_patch(corner, cols, facing, invertible, nodes: ti.template(), double: ti.template()):
-    """Return the `Patch` of a cell.
-
-    Args:
-        corner: first entry of the cell's upper left mass point in `nodes`.
-        cols: number of columns of mass points.
-        facing: as in `Outline`.
-        invertible: as in `Patch`.
-        nodes: projected mass points.
-        double: whether `nodes` is f64; the order of the sum in D differs.
-    """
+    """Return the `Patch` of a cell; for f64 (`double`), the sum in D has another order."""
     corners = ti.static(corner_entries(corner, cols, NODE_STRIDE))
     a, right, down, opposite = [ti.Vector([nodes[entry + n] for n in ti.static(range(4))]) for entry in corners]
     b, c = right - a, down - a
@@ -213,18 +160,9 @@ def cell_patch(corner, cols, facing, invertible, nodes: ti.template(), double: t
 
 @ti.func
 def edge(p_x, p_y, q_x, q_y, x, y, facing):
-    """Return twice the signed area of the triangle p, q, (x, y); the sign is the side of the line p q.
+    """Return twice the signed area of the triangle p, q, (x, y), times `facing`; the sign is the side of the line p q.
 
     Both cells at an edge compute the same bits, up to the sign.
-
-    Args:
-        p_x: column of the line's first point [samples].
-        p_y: row of the first point [samples].
-        q_x: column of the line's second point [samples].
-        q_y: row of the second point [samples].
-        x: undistorted columns [samples].
-        y: undistorted rows [samples].
-        facing: factor of the area, 1 or -1.
     """
     step_x, step_y = (q_x - p_x) * facing, (q_y - p_y) * facing
     return step_x * (y - p_y) - step_y * (x - p_x)
@@ -232,14 +170,7 @@ def edge(p_x, p_y, q_x, q_y, x, y, facing):
 
 @ti.func
 def edges(x, y, facing, outline: ti.template()):
-    """Return `edge` of the left, right, upper and lower edge of a cell; all are 0 or more inside the cell.
-
-    Args:
-        x: undistorted columns [samples].
-        y: undistorted rows [samples].
-        facing: 1 if the front of the cell is visible, -1 for its back.
-        outline: projected corners of the cell.
-    """
+    """Return `edge` of the left, right, upper and lower edge of a cell; all are 0 or more inside the cell."""
     p, q = ti.static((outline.x, outline.y))
     return (
         edge(p[0], q[0], p[2], q[2], x, y, -facing),
@@ -253,12 +184,7 @@ def edges(x, y, facing, outline: ti.template()):
 def find_quads(x, y, inside, subdivisions, patch: ti.template()):
     """Return the column and the row of the sub-quads at samples, by inverting the bilinear map of their cell.
 
-    Args:
-        x: undistorted columns [samples].
-        y: undistorted rows [samples].
-        inside: mask of the samples in the cell; the others have sub-quad (0, 0).
-        subdivisions: sub-quads along a side of the cell.
-        patch: bilinear surface of the cell.
+    Samples that are not `inside` have sub-quad (0, 0).
     """
     # The two equations are a_1 + b_1 s + c_1 t + d_1 s t = 0, and the same with 2.
     coefficients = ti.static((patch.a, patch.b, patch.c, patch.d))
@@ -282,17 +208,7 @@ def find_quads(x, y, inside, subdivisions, patch: ti.template()):
 
 @ti.func
 def triangle_at(x, y, quad_column, quad_row, quad_side, lower, patch: ti.template()):
-    """Return the `Triangle` of a sub-quad at samples.
-
-    Args:
-        x: undistorted columns [samples].
-        y: undistorted rows [samples].
-        quad_column: column of the sub-quads in their cell, one per lane.
-        quad_row: row of the sub-quads in their cell, one per lane.
-        quad_side: side of the sub-quads, as a fraction of the cell's.
-        lower: whether the triangle is below the diagonal; used only unless the cell is invertible.
-        patch: bilinear surface of the cell.
-    """
+    """Return the `Triangle` of a sub-quad at samples."""
     a, b, c, d = ti.static((patch.a, patch.b, patch.c, patch.d))
     s0 = quad_column * quad_side
     t0 = quad_row * quad_side
@@ -316,13 +232,7 @@ def triangle_at(x, y, quad_column, quad_row, quad_side, lower, patch: ti.templat
 
 @ti.func
 def on_triangle(x, y, triangle: ti.template()):
-    """Return the coordinates s and t of samples on a triangle.
-
-    Args:
-        x: undistorted columns [samples].
-        y: undistorted rows [samples].
-        triangle: drawn triangle of a sub-quad.
-    """
+    """Return the coordinates s and t of samples on a triangle."""
     # The two equations are p_1 + r_1 s + d_1 t = 0, and the same with 2.
     coefficients = ti.static((triangle.p, triangle.r, triangle.d))
     p_1, r_1, d_1 = [k[0] - x * k[2] for k in coefficients]
@@ -333,15 +243,7 @@ def on_triangle(x, y, triangle: ti.template()):
 
 @ti.func
 def is_within(s, t, enlargement, near, triangle: ti.template()):
-    """Return whether (s, t) is in an enlarged triangle and in front of the near plane.
-
-    Args:
-        s: coordinate on the triangle, to the right.
-        t: coordinate on the triangle, down.
-        enlargement: width of the margin around the triangle, as a fraction of its side.
-        near: near plane [m].
-        triangle: drawn triangle of a sub-quad.
-    """
+    """Return whether (s, t) is in an enlarged triangle and in front of the near plane."""
     larger = ti.select(triangle.below, t, s)
     smaller = ti.select(triangle.below, s, t)
     return (
@@ -354,26 +256,13 @@ def is_within(s, t, enlargement, near, triangle: ti.template()):
 
 @ti.func
 def depth_at(s, t, triangle: ti.template()):
-    """Return the depth of a triangle's plane [m].
-
-    Args:
-        s: coordinate on the triangle, to the right.
-        t: coordinate on the triangle, down.
-        triangle: drawn triangle of a sub-quad.
-    """
+    """Return the depth of a triangle's plane [m]."""
     return triangle.p[3] + triangle.r[3] * s + triangle.d[3] * t
 
 
 @ti.func
 def facet(x, y, triangle: ti.template(), uniforms: ti.template()):
-    """Return the normal of a triangle, on its visible side, of any length; a list in OpenCV's axes.
-
-    Args:
-        x: undistorted columns [samples].
-        y: undistorted rows [samples].
-        triangle: drawn triangle of a sub-quad.
-        uniforms: constants of the view, as returned by `view_uniforms`.
-    """
+    """Return the normal of a triangle, on its visible side, of any length; a list in OpenCV's axes."""
     sides = [
         [
             (k[0] - k[2] * uniforms[uni.CENTRE_X]) * uniforms[uni.SPREAD_X],
@@ -392,16 +281,9 @@ def facet(x, y, triangle: ti.template(), uniforms: ti.template()):
 
 @ti.func
 def may_cover_rows(corner, distorted_entry, cols, top, bottom, uniforms: ti.template(), nodes: ti.template()):
-    """Return whether a cell may overlap rows of a distorted picture; cheaper than `distorted_cell_bounds`.
+    """Return whether a cell may overlap rows `top` to `bottom` of a distorted picture.
 
-    Args:
-        corner: first entry of the cell's upper left mass point in `nodes`.
-        distorted_entry: first entry of its distorted position in `nodes`.
-        cols: number of columns of mass points.
-        top: first row [samples].
-        bottom: row after the last one [samples].
-        uniforms: constants of the view, as returned by `view_uniforms`.
-        nodes: projected mass points.
+    This test is cheaper than `distorted_cell_bounds`.
     """
     distorted_corners = ti.static(corner_entries(distorted_entry, cols, DISTORTED_STRIDE))
     valid = [nodes[entry + 2] for entry in distorted_corners]
@@ -416,15 +298,7 @@ def may_cover_rows(corner, distorted_entry, cols, top, bottom, uniforms: ti.temp
 
 @ti.func
 def distorted_cell_bounds(distorted_entry, cols, outline: ti.template(), uniforms: ti.template(), nodes: ti.template()):
-    """Return the bounding box of a cell in a distorted picture, as `lens_kernels.distorted_bounds`.
-
-    Args:
-        distorted_entry: first entry of the distorted upper left mass point in `nodes`.
-        cols: number of columns of mass points.
-        outline: projected corners of the cell, without distortion.
-        uniforms: constants of the view, as returned by `view_uniforms`.
-        nodes: projected mass points.
-    """
+    """Return the bounding box of a cell in a distorted picture, as `lens_kernels.distorted_bounds`."""
     corners = ti.static(corner_entries(distorted_entry, cols, DISTORTED_STRIDE))
     is_valid = nodes[corners[0] + 2] + nodes[corners[1] + 2] + nodes[corners[2] + 2] + nodes[corners[3] + 2] > 3.5
     distorted_x = [nodes[entry] for entry in corners]
@@ -434,16 +308,10 @@ def distorted_cell_bounds(distorted_entry, cols, outline: ti.template(), uniform
 
 @ti.func
 def is_off_screen(corners: ti.template(), left, right, top, bottom):
-    """Return whether a polygon is beyond an edge of the picture; parts of it may be behind the camera.
+    """Return whether a polygon of corners (X, Y, w, ...) is beyond an edge of the undistorted picture [samples].
 
-    The right edge x is the plane X = x w, which extends behind the camera: beyond it, X > x w at all corners.
-
-    Args:
-        corners: list of the corners, vectors (X, Y, w, ...).
-        left: left edge of the picture, undistorted [samples].
-        right: right edge [samples].
-        top: upper edge [samples].
-        bottom: lower edge [samples].
+    Parts of it may be behind the camera: the right edge x is the plane X = x w, which extends there. Beyond it, X > x w
+    at all corners.
     """
     off_screen = False
     for axis, sign, edge in ti.static(((0, -1.0, left), (0, 1.0, right), (1, -1.0, top), (1, 1.0, bottom))):
@@ -461,21 +329,7 @@ def triangle_bounds(
 ):  # fmt: skip
     """Return the bounding box of a triangle of a sub-quad in the picture, and its enlargement.
 
-    Args:
-        quad_column: column of the sub-quad in its cell.
-        quad_row: row of the sub-quad in its cell.
-        lower: whether the triangle is the one below the diagonal.
-        quad_side: side of the sub-quad, as a fraction of the cell's.
-        near: near plane [m].
-        width: width of the picture [samples].
-        height: height of the picture [samples].
-        patch: bilinear surface of the cell.
-        uniforms: constants of the view, as returned by `view_uniforms`.
-        lens: name of the lens model; empty without lens distortion.
-
-    Returns:
-        Least and largest x, least and largest y [samples], with largest below least outside the picture; the
-        enlargement that closes gaps, as a fraction of the triangle's side.
+    The box is the least and largest x, least and largest y [samples], with largest below least outside the picture.
     """
     a, b, c, d = ti.static((patch.a, patch.b, patch.c, patch.d))
     low_x, high_x, low_y, high_y = 0.0, ti.cast(width, ti.f32), -INFINITY, INFINITY

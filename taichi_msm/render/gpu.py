@@ -30,14 +30,7 @@ MAX_PARTS = 1 << 22
 
 
 class Threads:
-    """Memory and kernels of one sheet's pictures on a GPU.
-
-    Args:
-        config: compile-time configuration.
-        shape: rows and columns of mass points.
-        size: width and height of the picture [px].
-        texels: levels of the texture, as returned by `pyramid`.
-    """
+    """Memory and kernels of pictures of `size` (width, height) [px] of a sheet of `shape` (rows, cols), on a GPU."""
 
     def __init__(
         self, config: DrawingConfig, shape: tuple[int, int], size: tuple[int, int], texels: NDArray[np.float32]
@@ -69,19 +62,7 @@ class Threads:
     def draw(
         self, position: NDArray[np.float32], uniforms: NDArray[np.float32], sizes: NDArray[np.int32]
     ) -> tuple[NDArray[np.uint8], NDArray[np.float32]]:
-        """Draw the picture, the labels or both, as configured.
-
-        Args:
-            position: positions of the mass points [m], shape (rows, cols, 3).
-            uniforms: constants of the view, as returned by `view_uniforms`.
-            sizes: sizes and counters, as returned by `sizes_of`.
-
-        Returns:
-            Colours, shape (height, width, 3), and values for `labels_of`; undefined unless configured.
-
-        Raises:
-            DeviceError: when the device ended a thread early.
-        """
+        """Return colours, shape (height, width, 3), and values for `labels_of`; undefined unless configured."""
         launches, factor = Launches(bounded=True), self._config.supersample
         (width, height), instruments = self._size, int(sizes[uni.INSTRUMENT_COUNT])
         samples_across, samples_down = width * factor, height * factor
@@ -140,13 +121,6 @@ def _sheet_kernels(config: DrawingConfig) -> tuple[Callable[..., None], Callable
         """Project the mass points, and count the pieces of each cell.
 
         A cell has one piece if it is invertible, one per triangle if not, and none behind the eye.
-
-        Args:
-            position: positions of the mass points [m], shape (rows, cols, 3).
-            uniforms: constants of the view, as returned by `view_uniforms`.
-            sizes: sizes and counters, as returned by `sizes_of`.
-            nodes: projected mass points, written; shape (rows * cols * POINT_STRIDE,).
-            pieces: number of pieces of each cell, written; shape ((rows - 1) * (cols - 1),).
         """
         for index in range(sizes[uni.ROWS] * sizes[uni.COLS]):
             picture = ti.static(read_arguments(uniforms, sizes, nodes, (), config))
@@ -165,20 +139,9 @@ def _sheet_kernels(config: DrawingConfig) -> tuple[Callable[..., None], Callable
         first: ti.i32, end: ti.i32, ended: Integers, pieces_per_part: ti.i32, uniforms: Floats, sizes: Integers,
         ends: Integers, nodes: Floats, pieces: Integers, owners: Integers, bounds: Integers,
     ):  # fmt: skip
-        """Compute the cell, the first piece and the bounding box [samples] of parts.
+        """Compute the cell and the first piece (`owners`, shape (2 * parts,)) and the bounding box [samples] of parts.
 
-        Args:
-            first: first part of the launch.
-            end: part after the last one.
-            ended: counter of finished threads, for `end_thread`.
-            pieces_per_part: maximum number of pieces in a part.
-            uniforms: constants of the view, as returned by `view_uniforms`.
-            sizes: sizes and counters, as returned by `sizes_of`.
-            ends: cumulative number of parts up to and including each cell.
-            nodes: projected mass points.
-            pieces: number of pieces of each cell.
-            owners: cell and first piece of each part, written; shape (2 * parts,).
-            bounds: bounding box of each part, as stored by `store_bounds`, written.
+        `ends` is the number of parts up to and including each cell.
         """
         for item in range(first, end):
             picture = ti.static(read_arguments(uniforms, sizes, nodes, (), config))
@@ -238,25 +201,9 @@ def _picture_kernels(config: DrawingConfig) -> tuple[Callable[..., None], Callab
         bounds: Integers, starts: Integers, entries: Integers,
         samples: ti.types.ndarray(dtype=config.float_vector, ndim=1),
     ):  # fmt: skip
-        """Cover the samples of a strip with a chunk of the parts in their bins.
+        """Cover the samples of a strip, which begins at row `top`, with a chunk of the parts in their bins.
 
-        Args:
-            first: first sample of the launch, counted from the strip's first one.
-            end: sample after the last one.
-            ended: counter of finished threads, for `end_thread`.
-            top: first row of samples of the strip.
-            chunk_start: position of the first part of the chunk in each list; at 0 the samples are cleared.
-            chunk_size: number of parts.
-            pieces_per_part: maximum number of pieces in a part.
-            uniforms: constants of the view, as returned by `view_uniforms`.
-            sizes: sizes and counters, as returned by `sizes_of`.
-            nodes: projected mass points.
-            pieces: number of pieces of each cell.
-            owners: cell and first piece of each part.
-            bounds: bounding box of each part.
-            starts: start of the list of each bin.
-            entries: parts of all lists.
-            samples: undistortion map, then the G-buffer of the strip, updated.
+        The chunk begins at position `chunk_start` of each list; at 0 the samples are cleared.
         """
         for index in range(first, end):
             picture = ti.static(read_arguments(uniforms, sizes, nodes, samples, config))
@@ -281,20 +228,7 @@ def _picture_kernels(config: DrawingConfig) -> tuple[Callable[..., None], Callab
         first: ti.i32, end: ti.i32, ended: Integers, row: ti.i32, uniforms: Floats, sizes: Integers, texels: Floats,
         samples: ti.types.ndarray(dtype=config.float_vector, ndim=1), colours: Bytes, labels: Floats,
     ):  # fmt: skip
-        """Cover the pixels of a strip with the instruments, and write their colours and labels.
-
-        Args:
-            first: first pixel of the launch, counted from the strip's first one.
-            end: pixel after the last one.
-            ended: counter of finished threads, for `end_thread`.
-            row: first row of pixels of the strip.
-            uniforms: constants of the view, as returned by `view_uniforms`.
-            sizes: sizes and counters, as returned by `sizes_of`.
-            texels: levels of the texture, as returned by `pyramid`.
-            samples: undistortion map, then the G-buffer of the strip, updated.
-            colours: red, green and blue of all pixels, row by row, written.
-            labels: all pixels of one label after the other, written.
-        """
+        """Cover the pixels of a strip, which begins at `row`, with the instruments; write their colours and labels."""
         for index in range(first, end):
             picture = ti.static(read_arguments(uniforms, sizes, (), samples, config))
             x, y = index % sizes[uni.WIDTH], row + index // sizes[uni.WIDTH]

@@ -81,12 +81,7 @@ class Channel(NamedTuple):
 
 
 def label_channels(plane: Any, names: Collection[str]) -> list[Channel]:
-    """Return the channels of labels; a label without planes has none, and is 0.
-
-    Args:
-        plane: index of each plane of the G-buffer, by name.
-        names: names of the labels.
-    """
+    """Return the channels of labels; a label without planes has none, and is 0."""
     return [
         Channel(getattr(plane, plane_name), label, offset, n)
         for _, label, offset in _label_offsets(names)
@@ -96,13 +91,7 @@ def label_channels(plane: Any, names: Collection[str]) -> list[Channel]:
 
 
 def labels_of(numbers: NDArray[np.float32], size: tuple[int, int], names: Collection[str]) -> Labels:
-    """Return the labels of a picture.
-
-    Args:
-        numbers: output of kernel 2, all pixels of one label after the other.
-        size: width and height of the picture [px].
-        names: names of the labels.
-    """
+    """Return the labels of a picture of `size` (width, height) [px] from the values that kernel 2 writes."""
     (width, height), arrays = size, {}
     for name, label, offset in _label_offsets(names):
         count = len(label.planes)
@@ -128,19 +117,15 @@ class Flow(NamedTuple):
 
 
 class Stereo(NamedTuple):
-    """Labels of a stereo pair in the pixels of the first camera; None for those that were not requested.
+    """Labels of a stereo pair in the pixels of the first camera; None for those that were not requested."""
 
-    Attributes:
-        disparity: displacement from the first to the second picture, to the left [px], shape (height, width); 0 where
-            nothing is visible.
-        stereo: displacement from the first to the second picture, to the right and down [px], shape (height, width, 2);
-            NO_FLOW where nothing is visible, and where the visible point is behind the second eye.
-        stereo_occlusion: 255 where the visible point is occluded in the second picture or outside it, else 0, shape
-            (height, width).
-    """
-
+    # Displacement from the first to the second picture, to the left [px], shape (height, width); 0 where nothing is
+    # visible.
     disparity: NDArray[np.float32] | None = None
+    # Displacement from the first to the second picture, to the right and down [px], shape (height, width, 2); NO_FLOW
+    # where nothing is visible, and where the visible point is behind the second eye.
     stereo: NDArray[np.float32] | None = None
+    # 255 where the visible point is occluded in the second picture or outside it, else 0, shape (height, width).
     stereo_occlusion: NDArray[np.uint8] | None = None
 
 

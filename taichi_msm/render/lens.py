@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from taichi_msm.arithmetic import NUMPY
-from taichi_msm.dual import Dual, dual_operations
+from taichi_msm.dual import DUAL, Dual
 from taichi_msm.lenses import MODELS
 
 Array = NDArray[np.float64]
@@ -41,11 +41,7 @@ class Lens(NamedTuple):
     def undistort(self, distorted: Array) -> Array:
         """Invert `distort`, in closed form or by Newton's method from the solution without tangential distortion.
 
-        Args:
-            distorted: distorted normalised image coordinates, shape (..., 2).
-
-        Returns:
-            Undistorted coordinates, shape (..., 2); NaN without a solution within the limit of the lens.
+        Coordinates without a solution within the limit of the lens become NaN.
         """
         inverse = MODELS[self.model].undistort(distorted, self.coefficients)
         if inverse is not None:
@@ -78,10 +74,8 @@ class Lens(NamedTuple):
         return np.where(is_converged[..., None], points, np.nan)
 
     def _distort_with_jacobian(self, points: Array) -> tuple[Array, Array]:
-        distort, unit = (
-            MODELS[self.model].build(dual_operations(NUMPY)),
-            np.eye(2).reshape(2, 2, *(1,) * (points.ndim - 1)),
-        )
+        distort = MODELS[self.model].build(DUAL)
+        unit = np.eye(2).reshape(2, 2, *(1,) * (points.ndim - 1))
         x, y = (Dual(points[..., n], np.broadcast_to(unit[n], (2, *points.shape[:-1]))) for n in (0, 1))
         distorted = distort(x, y, *self.coefficients)
         jacobian = np.stack([np.moveaxis(number.slope, 0, -1) for number in distorted], axis=-2)

@@ -11,47 +11,21 @@ from typing import Any
 from taichi_msm.lenses import MODELS
 from taichi_msm.render import uniforms as uni
 from taichi_msm.render.undistortion import INVALID_COORDINATE
-from taichi_msm.system.runtime import kernel_operations, ti
-
-# The arctangent halves the angle HALVINGS times, and sums the power series of the remaining angle, whose terms have the
-# divisors SERIES, smallest term first.
-HALVINGS = 3
-SERIES = [(-1.0) ** n * (2 * n + 1) for n in reversed(range(12))]
-
-
-@ti.func
-def _arctangent(tangent):
-    """Return the angle of a tangent, 0 to pi / 2; GPUs have no arctangent in f64."""
-    half_tangent = tangent
-    for _ in ti.static(range(HALVINGS)):
-        half_tangent = half_tangent / (1.0 + ti.sqrt(1.0 + half_tangent * half_tangent))
-    square = half_tangent * half_tangent
-    # 1 and 0 in the precision of the argument; a quotient of constants would be f32.
-    unit = half_tangent * 0.0 + 1.0
-    total = half_tangent * 0.0
-    for divisor in ti.static(SERIES):
-        total = unit / divisor + square * total
-    return total * half_tangent * 2.0**HALVINGS
+from taichi_msm.system.kernel_operations import KERNEL
+from taichi_msm.system.runtime import ti
 
 
 @cache
 def compile_lens(lens: str) -> Callable[..., Any]:
     """Wrap the formula of a lens model for kernels."""
-    return ti.func(MODELS[lens].build(kernel_operations()._replace(arctan=_arctangent)))
+    return ti.func(MODELS[lens].build(KERNEL))
 
 
 @ti.func
 def distorted_point(x, y, uniforms: ti.template(), lens: ti.template()):
-    """Distort a point; a point beyond the limit of the lens is first moved to the limit.
+    """Return the distorted x and y of a point [samples], and whether it is within the limit of the lens.
 
-    Args:
-        x: undistorted column [samples].
-        y: undistorted row [samples].
-        uniforms: constants of the view, as returned by `view_uniforms`.
-        lens: name of the lens model.
-
-    Returns:
-        Distorted x and y [samples], and whether the point is within the limit of the lens.
+    A point beyond the limit is first moved to the limit.
     """
     a = (x - uniforms[uni.CENTRE_X]) * uniforms[uni.SPREAD_X]
     b = (y - uniforms[uni.CENTRE_Y]) * uniforms[uni.SPREAD_Y]
@@ -72,12 +46,7 @@ def distorted_point(x, y, uniforms: ti.template(), lens: ti.template()):
 
 @ti.func
 def squared_length(x: ti.template(), y: ti.template()):
-    """Return the squared length of the longest side of a triangle or a cell.
-
-    Args:
-        x: list of the columns of the vertices; those of a cell row by row.
-        y: list of the rows of the vertices.
-    """
+    """Return the squared length of the longest side of a triangle or a cell, whose vertices are in row order."""
     sides = ti.static(((0, 1), (1, 2), (2, 0)) if len(x) == 3 else ((0, 1), (1, 3), (3, 2), (2, 0)))
     squares = [(x[n] - x[m]) * (x[n] - x[m]) + (y[n] - y[m]) * (y[n] - y[m]) for n, m in sides]
     return ti.max(*squares)
@@ -90,16 +59,8 @@ def distorted_bounds(
 ):  # fmt: skip
     """Return the bounding box of the samples that a triangle or a cell covers after distortion.
 
-    Args:
-        x: list of the columns of the undistorted vertices [samples].
-        y: list of the rows of the undistorted vertices [samples].
-        distorted_x: list of the columns of the distorted vertices [samples].
-        distorted_y: list of the rows of the distorted vertices [samples].
-        is_valid: whether all vertices are within the limit of the lens.
-        uniforms: constants of the view, as returned by `view_uniforms`.
-
-    Returns:
-        Least and largest x, least and largest y [samples], with largest below least outside the picture.
+    `x` and `y` list its undistorted vertices; `is_valid` is whether all are within the limit of the lens. The box is
+    the least and largest x, least and largest y [samples], with largest below least outside the picture.
     """
     squared = squared_length(x, y)
     margin = ti.min(uniforms[uni.STRETCH_FACTOR] * ti.sqrt(squared), 1e6)

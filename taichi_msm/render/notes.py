@@ -69,7 +69,6 @@ def _describe_lens(camera: Camera, view: View) -> str:
 
 
 def _camera_key(name: str) -> str:
-    """Return the key of a camera by its name."""
     return f"render.cameras.{name}" if name else "render.camera"
 
 

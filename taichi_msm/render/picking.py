@@ -1,4 +1,4 @@
-"""Picking: the material point at a pixel, the inverse of projection."""
+"""Picking: the material point at a pixel (column, row), counted from (0, 0); the inverse of projection."""
 
 from __future__ import annotations
 
@@ -15,19 +15,13 @@ Pair = tuple[float, float]
 
 
 def pick(position: NDArray[np.floating], refine: int, view: View, pixel: Pair) -> Pair | None:
-    """Return the material point at the centre of a pixel, on the nearest triangle there.
+    """Return the material point at the centre of a pixel, on the nearest triangle there; None without a surface.
+
+    It is in fractions of the sheet's width from its left and of its height from its top. `position` are the positions
+    of the mass points [m], shape (rows, cols, 3).
 
     A point (X, Y, w, depth) projects to (x, y) if a = X - x w and b = Y - y w are 0. Both are linear, and need no
     division by w, which is 0 or negative behind the camera.
-
-    Args:
-        position: positions of the mass points [m], shape (rows, cols, 3).
-        refine: vertices inserted between neighbouring mass points.
-        view: resolved camera.
-        pixel: column and row, counted from (0, 0).
-
-    Returns:
-        Fractions of the sheet's width from its left and of its height from its top; None without a surface.
     """
     rows, cols = position.shape[:2]
     ray = view.centred_at(pixel)
@@ -44,15 +38,7 @@ def pick(position: NDArray[np.floating], refine: int, view: View, pixel: Pair) -
 
 
 def intersect_rest_plane(view: View, pixel: Pair) -> NDArray[np.floating] | None:
-    """Intersect the line of sight through a pixel's centre with the plane of the sheet at rest.
-
-    Args:
-        view: resolved camera.
-        pixel: column and row, counted from (0, 0).
-
-    Returns:
-        x and y [m]; None without an intersection in front of the camera.
-    """
+    """Return x and y [m] of the point of the sheet's plane at rest that a pixel shows; None without one."""
     matrix = view.centred_at(pixel).matrix
     planar = matrix[:2, :2]
     # Outside of a lens's image the matrix is NaN.

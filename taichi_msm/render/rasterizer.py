@@ -30,13 +30,9 @@ from taichi_msm.system.runtime import lanes
 def drawing_config(
     scene: Scene, *, picture: bool = True, labels: Collection[str] = (), lens: str | None = None
 ) -> DrawingConfig:
-    """Return the compile-time configuration of kernel 2 for a scene.
+    """Return the compile-time configuration of kernel 2 for a scene, by default for its main camera's lens model.
 
-    Args:
-        scene: scene with the settings of rendering.
-        picture: whether colours are drawn.
-        labels: names of the labels that are written; together with a picture, only for one sample per pixel.
-        lens: lens model of the camera, as `View.lens_model`; by default that of the scene's main camera.
+    Labels together with a picture need one sample per pixel.
     """
     render = scene.render
     tissue = picture and render.shading == "tissue"
@@ -58,12 +54,9 @@ def drawing_config(
 
 
 class Rasterizer:
-    """Rasteriser of the pictures and labels of a scene; call `runtime.start` first.
+    """Rasteriser of the pictures and labels of a scene with a texture, shape (height, width, 3).
 
-    Args:
-        scene: scene that is rendered.
-        texture: texture of the sheet, shape (height, width, 3).
-        config: compile-time configuration; by default that of the scene's pictures.
+    Call `runtime.start` first. The configuration is by default that of the scene's pictures.
     """
 
     def __init__(self, scene: Scene, texture: NDArray[np.uint8], config: DrawingConfig | None = None) -> None:
@@ -78,46 +71,28 @@ class Rasterizer:
         self._backend: Bands | Threads = backend(self.config, scene.sheet.points, scene.render.size, texels)
 
     def draw(
-        self, position: NDArray[Any], camera: View | None = None, instruments: Sequence[Solid] = ()
+        self, position: NDArray[Any], view: View | None = None, instruments: Sequence[Solid] = ()
     ) -> NDArray[np.uint8]:
-        """Return the picture, shape (height, width, 3).
-
-        Args:
-            position: positions of the mass points [m], shape (rows, cols, 3).
-            camera: resolved camera; by default the scene's main camera at the start.
-            instruments: bodies of the tools in this frame.
-
-        Raises:
-            DeviceError: when the device ended a thread early.
-        """
-        picture = self.render(position, camera, instruments).picture
+        """Return the picture, shape (height, width, 3), as `render`."""
+        picture = self.render(position, view, instruments).picture
         assert picture is not None
         return picture
 
     def render(
-        self, position: NDArray[Any], camera: View | None = None, instruments: Sequence[Solid] = ()
+        self, position: NDArray[Any], view: View | None = None, instruments: Sequence[Solid] = ()
     ) -> FrameOutputs:
-        """Draw the picture, the labels or both, as configured.
+        """Draw the picture, the labels or both, as configured; `position` is in [m], shape (rows, cols, 3).
 
-        Args:
-            position: positions of the mass points [m], shape (rows, cols, 3).
-            camera: resolved camera; by default the scene's main camera at the start.
-            instruments: bodies of the tools in this frame.
-
-        Returns:
-            The picture and the labels; None for those that are not configured.
-
-        Raises:
-            DeviceError: when the device ended a thread early.
+        The view is by default the scene's main camera at the start. Raise a DeviceError if the device ends a thread
+        early.
         """
-        config, camera = self.config, camera or self._view
-        if config.lens and camera.optics != self._optics:
-            self._optics = camera.optics
-            self._backend.set_undistortion_map(
-                undistortion_map(camera, config.supersample, with_steps=config.map_has_steps)
-            )
+        config, view = self.config, view or self._view
+        if config.lens and view.optics != self._optics:
+            self._optics = view.optics
+            table = undistortion_map(view, config.supersample, with_steps=config.map_has_steps)
+            self._backend.set_undistortion_map(table)
         self._sizes[uni.INSTRUMENT_COUNT] = len(instruments)
-        uniforms = uni.view_uniforms(camera, self.scene, instruments, config.supersample, self._texture_size)
+        uniforms = uni.view_uniforms(view, self.scene, instruments, config.supersample, self._texture_size)
         picture, labels = self._backend.draw(
             np.ascontiguousarray(position, np.float32), uniforms.astype(np.float32), self._sizes
         )

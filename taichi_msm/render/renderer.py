@@ -39,39 +39,28 @@ class Shot(NamedTuple):
 class Renderer:
     """Renderer of the pictures and labels of a scene; call `runtime.start` first.
 
-    Args:
-        scene: scene that is rendered.
-        texture: texture of the sheet, shape (height, width, 3); by default the picture that the scene names.
-
-    Attributes:
-        scene: scene that is rendered; may be replaced by one that differs only in its probes.
-        view: the scene's main camera at the start.
+    The texture, shape (height, width, 3), is by default the picture that the scene names. `scene` may be replaced by
+    one that differs only in its probes; `view` is its main camera at the start.
     """
 
     def __init__(self, scene: Scene, texture: NDArray[np.uint8] | None = None) -> None:
         self._custom_texture = texture
-        self._cached_texture: tuple[object, NDArray[np.uint8]] | None = None
         self._rasterizers: dict[tuple[object, ...], Rasterizer] = {}
         self.restart(scene)
 
     def restart(self, scene: Scene) -> None:
         """Replace the scene, and discard its rasterisers."""
         self._rasterizers.clear()
+        self._texture = self._custom_texture
         self.scene, self.view = scene, view_at(scene, 0.0)
         names = scene.render.all_cameras
         self._has_moving_camera = any(is_moving(scene, name) for name in names)
         self._views = {name: self.view if name == scene.render.main else view_at(scene, 0.0, name) for name in names}
 
     def resolve_camera(self, camera: CameraLike, time: float = 0.0) -> View:
-        """Return the view of a camera.
+        """Return the view of a camera at a time [s]; raise an ArgumentError for an unknown name.
 
-        Args:
-            camera: the camera, in any form of `CameraLike`.
-            time: time [s].
-
-        Raises:
-            ArgumentError: when no camera has this name.
-            SceneError: when the camera is invalid.
+        An invalid camera raises a SceneError.
         """
         if isinstance(camera, View):
             return camera
@@ -89,25 +78,12 @@ class Renderer:
         return view(self.scene.model_copy(update={"render": single_camera, "output": ()}), time)
 
     def draw(self, shot: Shot, style: Render | None = None) -> NDArray[np.uint8]:
-        """Draw a picture.
+        """Draw a picture, shape (height, width, 3); `style` may differ from the scene in `shading` and `wireframe`."""
+        return self._rasterizer(style, picture=True, view=shot.view).draw(*shot)
 
-        Args:
-            shot: sheet, camera and instruments.
-            style: rendering settings that replace those of the scene; they may differ in `shading` and `wireframe`.
-
-        Returns:
-            Colours, shape (height, width, 3).
-        """
-        return self._rasterizer(style, picture=True, camera=shot.view).draw(*shot)
-
-    def is_compiled(self, style: Render, camera: View) -> bool:
-        """Return whether the kernel of `draw` is compiled already.
-
-        Args:
-            style: rendering settings, as for `draw`.
-            camera: resolved camera.
-        """
-        return self._key(style, picture=True, camera=camera) in self._rasterizers
+    def is_compiled(self, style: Render, view: View) -> bool:
+        """Return whether the kernel of `draw` is compiled already."""
+        return self._key(style, picture=True, view=view) in self._rasterizers
 
     def kernels(self) -> tuple[object, ...]:
         """Return the compile-time settings of all kernels of `observe`, as a cache key."""
@@ -123,17 +99,9 @@ class Renderer:
         return self._labels(shot, LABELS)
 
     def flow(self, before: Labels, shot: Shot) -> Flow:
-        """Compute the optical flow to a shot.
+        """Compute the optical flow to a shot from the one with the labels `before`.
 
-        Args:
-            before: labels of the first shot.
-            shot: the second shot.
-
-        Returns:
-            Flow and occlusion of the pixels of the first shot.
-
-        Raises:
-            ArgumentError: when the labels do not fit the scene.
+        Labels that do not fit the scene raise an ArgumentError.
         """
         width, height = self.scene.render.size
         points = as_array(before.coordinates, "before") if isinstance(before, Labels) else np.empty(0)
@@ -145,17 +113,9 @@ class Renderer:
         return compute_flow(self.scene, points, *shot)
 
     def locate(self, coordinates: Array, shot: Shot) -> Sight:
-        """Project material points into a shot, and determine their occlusion.
+        """Project material points, with coordinates on the sheet, shape (n, 2), and determine their occlusion.
 
-        Args:
-            coordinates: coordinates on the sheet, from 0 to 1, shape (n, 2).
-            shot: sheet, camera and instruments.
-
-        Returns:
-            Pixels and occlusion of the points.
-
-        Raises:
-            ArgumentError: when the coordinates are invalid.
+        Coordinates that are not numbers from 0 to 1 raise an ArgumentError.
         """
         points = as_array(coordinates, "coordinates")
         if not (is_real_array(points, (*points.shape[:1], 2)) and ((points >= 0) & (points <= 1)).all()):
@@ -167,15 +127,7 @@ class Renderer:
         return locate_points(self.scene, points, *shot)
 
     def observe(self, before: Labels | None, shot: Shot) -> FrameOutputs:
-        """Render all outputs that the scene requests.
-
-        Args:
-            before: labels of the previous frame, for the optical flow; None for the first frame.
-            shot: sheet, camera and instruments.
-
-        Returns:
-            The outputs of the frame.
-        """
+        """Render all outputs that the scene requests; `before` are the labels of the previous frame, if any."""
         scene = self.scene
         # Labels require a sample at the centre of each pixel; supersampling has none there.
         is_single_sample = scene.render.supersample == 1
@@ -183,7 +135,7 @@ class Renderer:
         observed = FrameOutputs()
         if scene.draws:
             labels = requested if scene.labels_pixels and is_single_sample else frozenset[str]()
-            observed = self._rasterizer(picture=True, labels=labels, camera=shot.view).render(*shot)
+            observed = self._rasterizer(picture=True, labels=labels, view=shot.view).render(*shot)
         if scene.labels_pixels and observed.labels is None:
             observed = observed._replace(labels=self._labels(shot, requested))
         if observed.labels is not None and scene.asks_for("stereo") and shot.view.companion is not None:
@@ -208,32 +160,25 @@ class Renderer:
         return Stereo(disparity, *compute_stereo(self.scene, labels, *shot))
 
     def _labels(self, shot: Shot, names: Collection[str]) -> Labels:
-        labels = self._rasterizer(picture=False, labels=names, camera=shot.view).render(*shot).labels
+        labels = self._rasterizer(picture=False, labels=names, view=shot.view).render(*shot).labels
         assert labels is not None
         return labels
 
     def _rasterizer(
-        self, style: Render | None = None, *, picture: bool, labels: Collection[str] = (), camera: View
+        self, style: Render | None = None, *, picture: bool, labels: Collection[str] = (), view: View
     ) -> Rasterizer:
-        key = self._key(style or self.scene.render, picture=picture, labels=labels, camera=camera)
+        key = self._key(style or self.scene.render, picture=picture, labels=labels, view=view)
         if key not in self._rasterizers:
             from taichi_msm.render.rasterizer import Rasterizer, drawing_config
 
             scene = self.scene if style is None else self.scene.model_copy(update={"render": style})
-            texture = self._texture() if picture else np.zeros((1, 1, 3), np.uint8)
-            config = drawing_config(scene, picture=picture, labels=labels, lens=camera.lens_model)
+            texture = np.zeros((1, 1, 3), np.uint8)
+            if picture:
+                texture = self._texture = load_texture(self.scene) if self._texture is None else self._texture
+            config = drawing_config(scene, picture=picture, labels=labels, lens=view.lens_model)
             self._rasterizers[key] = Rasterizer(scene, texture, config)
         return self._rasterizers[key]
 
-    def _key(self, style: Render, *, picture: bool, labels: Collection[str] = (), camera: View) -> tuple[object, ...]:
+    def _key(self, style: Render, *, picture: bool, labels: Collection[str] = (), view: View) -> tuple[object, ...]:
         """Return the cache key of a rasteriser: all settings that differ among the rasterisers of a scene."""
-        return picture, frozenset(labels), camera.optics, style.shading, style.wireframe, self.scene.shapes
-
-    def _texture(self) -> NDArray[np.uint8]:
-        """Return the texture, loaded again only if the scene names another picture."""
-        if self._custom_texture is not None:
-            return self._custom_texture
-        source = self.scene.image, self.scene.region, self.scene.render.background
-        if self._cached_texture is None or self._cached_texture[0] != source:
-            self._cached_texture = source, load_texture(self.scene)
-        return self._cached_texture[1]
+        return picture, frozenset(labels), view.optics, style.shading, style.wireframe, self.scene.shapes

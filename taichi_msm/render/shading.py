@@ -18,6 +18,8 @@ removes the share uniforms.SHADE / r^2 of the light.
 Mipmaps filter the texture, at 1, 1/2, 1/4, ... of its size, so that a sample of many texels is their mean.
 """
 
+from hashlib import sha256
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -25,6 +27,7 @@ from taichi_msm.render import uniforms as uni
 from taichi_msm.render.config import INFINITY, dot, sample_centres, triple, undistorted_centres
 from taichi_msm.render.geometry import line_of_sight, w_at
 from taichi_msm.render.labels import label_channels
+from taichi_msm.system.array_cache import cached_arrays
 from taichi_msm.system.runtime import ti
 
 
@@ -129,18 +132,7 @@ def _write_labels(entry, left, row, end_row, labels: ti.template(), band: ti.tem
 def resolve(
     row, end_row, left, right, texels: ti.template(), colours: ti.template(), labels: ti.template(), band: ti.template()
 ):
-    """Shade the samples of pixels in a band, and write the pixels' colours and labels.
-
-    Args:
-        row: first row [px].
-        end_row: row after the last one [px].
-        left: first column [px].
-        right: column after the last one [px].
-        texels: levels of the texture, as returned by `pyramid`.
-        colours: red, green and blue of all pixels, row by row, as words or bytes, written.
-        labels: all pixels of one label after the other, written.
-        band: the band, whose samples are covered.
-    """
+    """Shade the samples of the pixels in columns `left` to `right` of a band; write their colours and labels."""
     config = ti.static(band.config)
     factor, tile_width, tile_height = ti.static((config.supersample, config.tile_width, config.tile_height))
     lines = ((end_row - row) * factor + tile_height - 1) // tile_height
@@ -266,16 +258,18 @@ def _light_metal(x, y, depth, normal: ti.template(), uniforms: ti.template()):
 
 
 def pyramid(texture: NDArray[np.uint8], *, minified: bool) -> tuple[NDArray[np.float32], NDArray[np.int32]]:
-    """Build the mipmap levels of a texture, down to one texel.
+    """Build the mipmap levels of a texture, shape (height, width, 3), only the first unless `minified`.
 
-    Args:
-        texture: colours, shape (height, width, 3).
-        minified: whether all levels are built; otherwise only the first.
-
-    Returns:
-        Texels of all levels, row by row, each red + 256 green + 65536 blue, which f32 represents exactly; start, width
-        and height of every level, shape (levels, 3).
+    Return the texels of all levels, row by row, each red + 256 green + 65536 blue, which f32 represents exactly; and
+    start, width and height of every level, shape (levels, 3); both read-only.
     """
+    colours = np.ascontiguousarray(texture)
+    key = "pyramid", sha256(colours.data).digest(), colours.shape, minified
+    texels, levels = cached_arrays(key, lambda: _build_pyramid(colours, minified))
+    return texels, levels
+
+
+def _build_pyramid(texture: NDArray[np.uint8], minified: bool) -> tuple[NDArray[np.float32], NDArray[np.int32]]:
     level, texels, levels, first = texture, [], [], 0
     while True:
         height, width, _ = level.shape

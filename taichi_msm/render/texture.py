@@ -9,31 +9,33 @@ import numpy as np
 from numpy.typing import NDArray
 
 from taichi_msm.errors import ArgumentError, Problem, SceneError, as_array
-from taichi_msm.images import MAX_SIDE_PX, PictureError, has_transparency, picture_size, read_rgb
+from taichi_msm.images import MAX_SIDE_PX, PictureError, file_sha256, has_transparency, picture_size, read_rgb
 from taichi_msm.scene.scene import Scene
+from taichi_msm.system.array_cache import cached_arrays
 
 
 def load_texture(scene: Scene, sha256: str | None = None) -> NDArray[np.uint8]:
-    """Read the scene's picture: upright, in 8-bit RGB, cropped to the scene's region.
+    """Read the scene's picture: upright, in 8-bit RGB, cropped to the scene's region, shape (height, width, 3).
 
-    Only the first picture of a file is read. Transparent pixels are composited onto the scene's background.
-
-    Args:
-        scene: scene with the name of the picture and its region.
-        sha256: required SHA-256 of the file, in hexadecimal; any if None.
-
-    Returns:
-        Colours, shape (height, width, 3).
-
-    Raises:
-        SceneError: when there is no picture, or it is invalid.
+    Only the first picture of a file is read. Transparent pixels are composited onto the scene's background. A missing
+    or invalid picture, or one with another SHA-256 than `sha256`, raises a SceneError. The array is read-only, and the
+    same while the file has the same content.
     """
     if scene.image is None:
         raise SceneError(["image: no picture is named"])
     try:
-        image = read_rgb(scene.image, scene.render.background, sha256)
+        digest = file_sha256(scene.image)
+        # With another digest than the required one, reading fails, and nothing is cached.
+        key = digest, digest if sha256 is None else sha256, scene.render.background, scene.region
+        (texture,) = cached_arrays(("texture", *key), lambda: (_read(scene, key[1]),))
     except PictureError as error:
         raise SceneError([f"image: {error}"]) from None
+    return texture
+
+
+def _read(scene: Scene, sha256: str) -> NDArray[np.uint8]:
+    assert scene.image is not None
+    image = read_rgb(scene.image, scene.render.background, sha256)
     x, y, width, height = region = scene.region or (0, 0, *image.size)
     if outside := [str(problem) for problem in _region_problems(region, image.size)]:
         raise SceneError(outside)

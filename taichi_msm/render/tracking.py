@@ -44,21 +44,7 @@ NOT_VISIBLE = math.nan
 def locate_points(
     scene: Scene, coordinates: Array, position: Array, view: View, instruments: Sequence[Solid] = ()
 ) -> Sight:
-    """Project material points into a picture, and determine their occlusion.
-
-    Args:
-        scene: scene with the sheet and the size of the picture.
-        coordinates: coordinates of the points on the sheet, as in `Labels`, shape (n, 2).
-        position: positions of the mass points [m], shape (rows, cols, 3).
-        view: camera of the picture.
-        instruments: bodies of the tools at this time, which occlude points.
-
-    Returns:
-        Pixels and occlusion of the points.
-
-    Raises:
-        DeviceError: when the device ended a thread early.
-    """
+    """Project material points, with coordinates as in `Labels`, shape (n, 2), and determine their occlusion."""
     pixels, hidden = _track(scene, coordinates, position, view, instruments, as_flow=False)
     return Sight(pixels, hidden.view(np.bool_))
 
@@ -66,21 +52,7 @@ def locate_points(
 def compute_flow(
     scene: Scene, coordinates: Array, position: Array, view: View, instruments: Sequence[Solid] = ()
 ) -> Flow:
-    """Compute the optical flow from another frame to this one.
-
-    Args:
-        scene: scene with the sheet and the size of the picture.
-        coordinates: coordinates in the labels of the other frame, shape (height, width, 2).
-        position: positions of the mass points in this frame [m], shape (rows, cols, 3).
-        view: camera in this frame.
-        instruments: bodies of the tools in this frame, which occlude points.
-
-    Returns:
-        Flow and occlusion of the pixels of the other frame.
-
-    Raises:
-        DeviceError: when the device ended a thread early.
-    """
+    """Compute the optical flow from another frame, with these coordinates in its `Labels`, to this one."""
     shape = coordinates.shape[:2]
     moved, hidden = _track(scene, coordinates.reshape(-1, 2), position, view, instruments, as_flow=True)
     return Flow(moved.reshape(*shape, 2), hidden.reshape(shape) * np.uint8(255))
@@ -89,21 +61,7 @@ def compute_flow(
 def compute_stereo(
     scene: Scene, labels: Labels, position: Array, view: View, instruments: Sequence[Solid] = ()
 ) -> Flow:
-    """Compute the flow of the sheet and the instruments from a camera's picture to its companion's at the same time.
-
-    Args:
-        scene: scene with the sheet and the size of the picture.
-        labels: labels of the camera's picture.
-        position: positions of the mass points [m], shape (rows, cols, 3).
-        view: reference camera of the pair, with its companion.
-        instruments: bodies of the tools at this time, which occlude points.
-
-    Returns:
-        Flow and occlusion of the pixels of the camera's picture.
-
-    Raises:
-        DeviceError: when the device ended a thread early.
-    """
+    """Compute the flow of the sheet and the instruments from a camera's picture to its companion's at the same time."""
     companion = view.companion
     assert companion is not None
     flow, occlusion = compute_flow(scene, labels.coordinates, position, companion, instruments)
@@ -307,17 +265,7 @@ def _ray_kernel(shapes: tuple[str, ...]) -> Callable[..., None]:
     def intersect_lines(
         first: ti.i32, end: ti.i32, ended: Integers, pixels: Doubles, uniforms: Doubles, count: ti.i32, depth: Doubles
     ):
-        """Compute the depth of the nearest instrument on lines of sight.
-
-        Args:
-            first: first line of sight of the launch.
-            end: line of sight after the last one.
-            ended: counter of finished threads, for `end_thread`.
-            pixels: undistorted x and y of each line of sight [px], shape (2 * n,).
-            uniforms: constants of the view, as returned by `view_uniforms`.
-            count: number of instruments.
-            depth: depth [m], INFINITY without an intersection, written; shape (n,).
-        """
+        """Compute the depth [m] of the nearest instrument at pixels [px], shape (2 * n,); INFINITY without one."""
         for k in range(first, end):
             nearest = ti.cast(INFINITY, ti.f64)
             for index in range(count):
@@ -385,24 +333,9 @@ def _kernel(lens: str, shapes: tuple[str, ...], is_material: bool) -> Callable[.
     ):  # fmt: skip
         """Project points, and test their occlusion by a chunk of the cells in their bins.
 
-        Args:
-            first: first point of the launch.
-            end: point after the last one.
-            ended: counter of finished threads, for `end_thread`.
-            chunk_start: position of the first cell of the chunk in each list.
-            chunk_size: number of cells of the chunk.
-            points: coordinates of material points, shape (2 * n,); or X, Y, w and depth of points of instruments,
-                shape (4 * n,).
-            as_flow: 0 for pixels; 1 for displacements of points k from the centres of pixels k of another frame.
-            uniforms: constants of the undistorted view, and the lens.
-            sizes: sizes and counters, as returned by `sizes_of`.
-            nodes: projected mass points, NODE_STRIDE numbers each.
-            outlines: outlines of the cells, CELL_STRIDE numbers each.
-            starts: start of the list of each bin.
-            entries: cells of all lists.
-            is_simple: whether no two cells of a bin overlap.
-            pixels: pixels or displacements [px], shape (2 * n,), written.
-            hidden: whether the points are occluded or outside the picture, shape (n,), updated.
+        `points` are coordinates of material points, shape (2 * n,), or X, Y, w and depth of points of instruments,
+        shape (4 * n,). With `as_flow`, `pixels` are displacements of points k from the centres of pixels k of another
+        frame. `uniforms` are those of the undistorted view, with the lens.
         """
         for k in range(first, end):
             cols, width, height = sizes[uni.COLS], sizes[uni.WIDTH], sizes[uni.HEIGHT]

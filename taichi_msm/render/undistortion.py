@@ -81,16 +81,10 @@ def undistorted_view(view: View) -> View:
 
 
 def undistortion_map(view: View, supersample: int, *, with_steps: bool) -> NDArray[np.float32]:
-    """Compute the undistorted positions of all samples of a picture.
+    """Compute the undistorted x and y of all samples of a picture [samples], shape (rows, columns, 2).
 
-    Args:
-        view: camera with lens distortion.
-        supersample: samples per pixel along each axis.
-        with_steps: whether the steps to the next samples are included.
-
-    Returns:
-        x and y [samples], INVALID_COORDINATE beyond the limit of the lens, shape (rows, columns, 2). With steps, also x
-        and y of the step to the sample on the right and x and y of that to the sample below, shape (rows, columns, 6).
+    They are INVALID_COORDINATE beyond the limit of the lens. With steps, the shape is (rows, columns, 6): also x and y
+    of the step to the sample on the right, and x and y of that to the sample below.
     """
     assert view.lens is not None
     width, height = (int(side) * supersample for side in view.size)

@@ -83,12 +83,7 @@ KINDS = {name: float(number) for number, name in enumerate(SHAPES)}
 
 
 def sizes_of(scene: Scene, levels: NDArray[np.int32]) -> NDArray[np.int32]:
-    """Return the array of sizes and counters of a scene; those that change from frame to frame are 0.
-
-    Args:
-        scene: scene with the points of the sheet and the size of the picture.
-        levels: start, width and height of the levels of the texture, as returned by `pyramid`, shape (levels, 3).
-    """
+    """Return the array of sizes and counters of a scene, 0 where they vary by frame; `levels` as from `pyramid`."""
     sizes = np.zeros(LEVELS + levels.size, np.int32)
     sizes[[ROWS, COLS, WIDTH, HEIGHT, LEVEL_COUNT]] = *scene.sheet.points, *scene.render.size, len(levels)
     sizes[LEVELS:] = levels.flat
@@ -96,25 +91,17 @@ def sizes_of(scene: Scene, levels: NDArray[np.int32]) -> NDArray[np.int32]:
 
 
 def view_uniforms(
-    view: View, scene: Scene, instruments: Sequence[Solid], factor: int = 1, texture: tuple[int, int] = (1, 1)
+    view: View, scene: Scene, instruments: Sequence[Solid], supersample: int = 1, texture_size: tuple[int, int] = (1, 1)
 ) -> Array:
-    """Return the array of uniforms of a view.
-
-    Args:
-        view: resolved camera.
-        scene: scene with the rendering settings and the size of the sheet.
-        instruments: bodies of the tools in this frame.
-        factor: samples per pixel along each axis.
-        texture: width and height of the texture [texels].
-    """
+    """Return the array of uniforms of a view; `texture_size` is the width and height of the texture [texels]."""
     render, sheet = scene.render, scene.sheet.size
     uniforms = np.zeros(INSTRUMENTS + len(instruments) * INSTRUMENT_STRIDE)
-    uniforms[MATRIX:AXES] = (view.matrix * np.array([[factor], [factor], [1], [1]])).ravel()
+    uniforms[MATRIX:AXES] = (view.matrix * np.array([[supersample], [supersample], [1], [1]])).ravel()
     uniforms[AXES:NEAR] = view.axes.ravel()
     uniforms[NEAR:BACKGROUND] = view.near, render.refine + 1
     uniforms[BACKGROUND:CENTRE_X] = render.background
-    uniforms[CENTRE_X:SPREAD_X], uniforms[SPREAD_X:PINHOLE] = view.centre * factor, 1 / (view.scale * factor)
-    uniforms[PINHOLE], uniforms[MIDDLE_X:LIGHT_X] = view.pinhole, view.size / 2 * factor
+    uniforms[CENTRE_X:SPREAD_X], uniforms[SPREAD_X:PINHOLE] = view.centre * supersample, 1 / (view.scale * supersample)
+    uniforms[PINHOLE], uniforms[MIDDLE_X:LIGHT_X] = view.pinhole, view.size / 2 * supersample
     light_view, light = view.light_view or view, render.light
     light_position = np.array([LIGHT_RIGHT, LIGHT_UP, 0.0]) * light_view.distance
     light_distance = math.hypot(light_position[0], light_position[1], light_view.distance)
@@ -125,36 +112,27 @@ def view_uniforms(
     uniforms[LIGHT_DISTANCE:HEADLIGHT] = light_distance, normalisation, light.ambient, light.gloss, light.vignette
     uniforms[ACROSS:UP], uniforms[UP:SLOPE_X] = view.axes[:, 0], view.axes[:, 1]
     height = light.relief / 100 / 255 * max(sheet)
-    uniforms[SLOPE_X:DEPTH_TOLERANCE] = height * texture[0] / sheet[1], -height * texture[1] / sheet[0]
+    uniforms[SLOPE_X:DEPTH_TOLERANCE] = height * texture_size[0] / sheet[1], -height * texture_size[1] / sheet[0]
     uniforms[DEPTH_TOLERANCE] = 1e-9 * max(sheet)
     if view.lens is not None:
         region = visible_region(view)
-        set_lens(uniforms, view, factor, region.radius)
-        uniforms[VISIBLE:SAGITTA_FACTOR] = np.array(region.box) * factor
-        uniforms[SAGITTA_FACTOR], uniforms[STRETCH_FACTOR] = region.sagitta_factor / factor, region.stretch_factor
-    for n, instrument in enumerate(instruments):
-        uniforms[INSTRUMENTS + n * INSTRUMENT_STRIDE : INSTRUMENTS + (n + 1) * INSTRUMENT_STRIDE] = (
-            _instrument_uniforms(instrument, view, factor)
-        )
+        set_lens(uniforms, view, supersample, region.radius)
+        uniforms[VISIBLE:SAGITTA_FACTOR] = np.array(region.box) * supersample
+        uniforms[SAGITTA_FACTOR], uniforms[STRETCH_FACTOR] = region.sagitta_factor / supersample, region.stretch_factor
+    for numbers, solid in zip(uniforms[INSTRUMENTS:].reshape(-1, INSTRUMENT_STRIDE), instruments, strict=True):
+        numbers[:] = _instrument_uniforms(solid, view, supersample)
     return uniforms
 
 
-def set_lens(uniforms: Array, view: View, factor: int, radius: float) -> None:
-    """Set the uniforms of a lens.
-
-    Args:
-        uniforms: uniforms of the view, updated.
-        view: camera with lens distortion.
-        factor: samples per pixel along each axis.
-        radius: limit of the lens, or the largest visible radius, at w = 1 [m].
-    """
+def set_lens(uniforms: Array, view: View, supersample: int, radius: float) -> None:
+    """Set the uniforms of a lens, with its limit or the largest visible radius, at w = 1 [m]."""
     assert view.lens is not None
     uniforms[LENS : LENS + len(view.lens.coefficients)] = view.lens.coefficients
     uniforms[LENS_RADIUS] = radius
-    uniforms[PICTURE_X:FOCAL_X], uniforms[FOCAL_X:VISIBLE] = view.centre * factor, view.scale * factor
+    uniforms[PICTURE_X:FOCAL_X], uniforms[FOCAL_X:VISIBLE] = view.centre * supersample, view.scale * supersample
 
 
-def _instrument_uniforms(solid: Solid, view: View, factor: int) -> Array:
+def _instrument_uniforms(solid: Solid, view: View, supersample: int) -> Array:
     uniforms = np.empty(INSTRUMENT_STRIDE)
     uniforms[TIP:AXIS] = view.axes @ (solid.tip - view.eye)
     uniforms[AXIS:LENGTH] = view.axes @ solid.axis
@@ -170,5 +148,5 @@ def _instrument_uniforms(solid: Solid, view: View, factor: int) -> Array:
     if (w > view.near).all():
         projected = np.stack([x / w, y / w], axis=-1)
         low, high = np.clip([projected.min(axis=0), projected.max(axis=0)], low, high)
-    uniforms[LEFT:KIND], uniforms[KIND] = np.concatenate([low, high]) * factor, KINDS[solid.shape.name]
+    uniforms[LEFT:KIND], uniforms[KIND] = np.concatenate([low, high]) * supersample, KINDS[solid.shape.name]
     return uniforms

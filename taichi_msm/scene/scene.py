@@ -7,6 +7,7 @@ from typing import Annotated, Literal
 
 from pydantic import ConfigDict, Field, model_validator
 
+from taichi_msm.integrators import INTEGRATORS, Integrator
 from taichi_msm.scene.outputs import ENTRIES, OUTPUTS
 from taichi_msm.scene.render import Render
 from taichi_msm.scene.section import (
@@ -52,11 +53,11 @@ class Time(Section):
         "displacement; companion runs find the step",
         f"a number, {MIN_TOLERANCE:g} to {MAX_TOLERANCE:g}",
     )
-    damping_difference: Literal["central", "backward"] = key(
+    damping_difference: Literal[tuple(INTEGRATORS)] = key(  # type: ignore[valid-type]
         "central",
-        "finite difference for the velocity in the damping: central is of order 2, backward "
-        "(the paper's eq. 3) of order 1",
-        "central or backward",
+        "finite difference for the velocity in the damping: "
+        + "; ".join(f"{name}: {integrator.meaning}" for name, integrator in INTEGRATORS.items()),
+        " or ".join(INTEGRATORS),
     )
     precision: Literal["auto", "f32", "f64"] = key(
         "auto",
@@ -68,6 +69,11 @@ class Time(Section):
     def at_rest(self) -> bool:
         """Whether every frame is an equilibrium of the sheet."""
         return self.motion == "quasistatic"
+
+    @property
+    def integrator(self) -> Integrator:
+        """Integrator of `damping_difference`."""
+        return INTEGRATORS[self.damping_difference]
 
     @property
     def frames(self) -> int:

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Collection
-from typing import Literal
+from typing import Annotated, Literal
 
-from pydantic import model_validator
+from pydantic import Field, model_validator
 from typing_extensions import Self
 
+from taichi_msm.laws.locking import Locking
 from taichi_msm.scene.section import (
     MAX_POINTS,
     MAX_TOLERANCE,
@@ -15,11 +16,11 @@ from taichi_msm.scene.section import (
     FilePath,
     NodeCount,
     NotNegative,
+    Number,
     OpenUnitInterval,
     Positive,
     Section,
     Side,
-    StiffnessRatio,
     Tolerance,
     key,
     scene_fault,
@@ -91,11 +92,15 @@ class Springs(Section):
     map: StiffnessMap | None = key(None, "map of factors of structural and shear", "a mapping with image and range")
 
 
+_FACTOR = Locking.keys["factor"]
+Factor = Annotated[Number, Field(ge=_FACTOR.least, le=_FACTOR.most)]
+
+
 class Stiffening(Section):
     """Tissue that locks when it is stretched: its stiffness grows with the strain, up to a factor."""
 
     lock: Positive = key(..., "strain at which the springs lock", "a number above 0, a strain without a unit")
-    factor: StiffnessRatio = key(10.0, "largest stiffness, relative to that at rest", "a number from 1 to 1000")
+    factor: Factor = key(_FACTOR.default, _FACTOR.meaning, _FACTOR.expected)
 
 
 class RelaxationBranch(Section):
@@ -113,9 +118,7 @@ class Foundation(Section):
     lock: Positive | None = key(
         None, "depth of indentation at which the foundation locks [m]", "a number above 0, in metres"
     )
-    factor: StiffnessRatio = key(
-        10.0, "largest stiffness of a foundation that locks, relative to that at rest", "a number from 1 to 1000"
-    )
+    factor: Factor = key(_FACTOR.default, f"with lock: {_FACTOR.meaning}", _FACTOR.expected)
 
     def _unused_keys(self) -> Collection[str]:
         return () if self.lock else ("lock", "factor")

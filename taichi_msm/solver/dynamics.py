@@ -1,6 +1,6 @@
 """The sheet in motion: Verlet steps by kernel 1, with few launches per frame, and the forces of probes at frames.
 
-`model.verlet` contains the update rule.
+`integrators` contains the update rule.
 """
 
 from __future__ import annotations
@@ -18,7 +18,6 @@ from taichi_msm.model.sheet import rest_positions
 from taichi_msm.model.surface import surface_point
 from taichi_msm.model.time_grid import DTYPES
 from taichi_msm.model.tool_force import probe_force
-from taichi_msm.model.verlet import coefficients, mean_force
 from taichi_msm.solver.arrays import InitialData, SheetLayout, StepKernel
 from taichi_msm.solver.contact_corrections import sum_corrections
 from taichi_msm.solver.kernel_cpu import ScatterKernel
@@ -95,10 +94,10 @@ class Dynamics(SheetSolver[StepKernel]):
     def tool_forces(self) -> NDArray[np.float64]:
         """Compute the mean force of each position-controlled tool since the previous frame [N], shape (tools, 3).
 
-        The force would displace the mass points by the sum of the contact corrections, see `verlet.mean_force`.
+        A force displaces a mass point by the gain of the steps times the force; contact displaced them by corrections.
         """
         sums = sum_corrections(self.layout, self.kernel.arrays, clear=False)
-        return mean_force(self.plan, sums, self.plan.grid.steps_per_frame)
+        return sums / (self.plan.step_coefficients.gain * self.plan.grid.steps_per_frame)
 
     def step_table(self, first: int, count: int) -> NDArray[Any]:
         """Return the load table of consecutive steps, shape (count, columns).
@@ -108,7 +107,7 @@ class Dynamics(SheetSolver[StepKernel]):
             count: number of steps.
         """
         table = self._load_table(average_loads(self.plan, first, count), first)
-        _, table[:, GAIN], first_gain = coefficients(self.plan)
+        _, table[:, GAIN], first_gain = self.plan.step_coefficients
         if first == 0:
             table[0, GAIN] = first_gain
         return table

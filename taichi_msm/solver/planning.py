@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 
 from taichi_msm.errors import ArgumentError, Problem, SceneError
 from taichi_msm.images import PictureError
+from taichi_msm.integrators import INTEGRATORS
 from taichi_msm.model.plan import Plan, build_slots
 from taichi_msm.model.sheet import (
     MapImage,
@@ -33,7 +34,6 @@ from taichi_msm.model.sheet import (
 )
 from taichi_msm.model.time_grid import TimeGrid
 from taichi_msm.model.tools import Tool, build_tools, friction_problem, path_problems, speed_problem
-from taichi_msm.model.verlet import stability_limit
 from taichi_msm.scene.scene import Scene, Time
 from taichi_msm.scene.section import FRAME_TOLERANCE
 from taichi_msm.scene.sheet import Sheet
@@ -200,14 +200,14 @@ def choose_precision(plan: Plan, arch: str) -> Plan:
 
 
 def stable_step(material: Material, sheet: Sheet, difference: str) -> float:
-    """Return the largest stable step of a sheet [s], see `verlet.stability_limit`.
+    """Return the largest stable step of a sheet [s], see `Integrator.largest_step`.
 
     Args:
         material: coefficients of the sheet.
         sheet: section `sheet` of the scene.
         difference: difference quotient of the damping, central or backward.
     """
-    return stability_limit(highest_frequency(material, sheet), material.drag, difference)
+    return INTEGRATORS[difference].largest_step(highest_frequency(material, sheet), material.drag)
 
 
 def min_stable_steps(plan: Plan) -> int:

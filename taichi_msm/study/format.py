@@ -23,11 +23,7 @@ def format_number(value: float) -> str:
 
 
 def time_unit(seconds: float) -> tuple[float, str]:
-    """Choose the unit of time for a duration [s].
-
-    Returns:
-        Number of units per second, and name of the unit.
-    """
+    """Choose the unit of time for a duration [s]; return the number of units per second, and the name of the unit."""
     return next(((scale, name) for scale, name in TIME_UNITS if seconds * scale >= 0.9995), TIME_UNITS[-1])
 
 
@@ -65,16 +61,7 @@ def machine_summary(study: Study) -> str:
 
 
 def markdown_table(head: Sequence[str], rows: Sequence[Sequence[str]], left_columns: Sequence[int] = ()) -> str:
-    """Format a Markdown table.
-
-    Args:
-        head: names of the columns.
-        rows: cells of every row.
-        left_columns: indices of left-aligned columns; all others are right-aligned.
-
-    Returns:
-        The table, without a final line break.
-    """
+    """Format a Markdown table, without a final line break; columns other than `left_columns` are right-aligned."""
     widths = [max(len(row[column]) for row in [head, *rows]) for column in range(len(head))]
     separator = [
         "-" * width if column in left_columns else "-" * (width - 1) + ":" for column, width in enumerate(widths)
@@ -91,16 +78,7 @@ def markdown_table(head: Sequence[str], rows: Sequence[Sequence[str]], left_colu
 
 
 def format_table(measurements: Sequence[Any], columns: Columns, remark: Callable[[Any], str] | None = None) -> str:
-    """Format measurements as a Markdown table, with a row for each.
-
-    Args:
-        measurements: measurements of one kind.
-        columns: format functions of cells, by the name of the column.
-        remark: format function of an unnamed last column, which is left out if empty; None for no such column.
-
-    Returns:
-        The table, without a final line break.
-    """
+    """Format measurements as the rows of a Markdown table; the remarks, if any, are an unnamed last column."""
     if remark and any(map(remark, measurements)):
         columns = {**columns, "": remark}
     rows = [[cell(measurement) for cell in columns.values()] for measurement in measurements]

@@ -3,6 +3,9 @@
 - Work-precision diagram of stepping: every precision and damping difference, from the largest stable step downwards.
 - Work-precision diagram of the mesh: tissue with a quarter, half and twice the cells per side.
 - Work-precision diagram of drawing: every refinement and supersampling, for the most deformed frame.
+
+The results are added to a `Study`, which keeps the first ones after a KeyboardInterrupt from `progress`. `longest_run`
+is the approximate time limit of a run [s].
 """
 
 from __future__ import annotations
@@ -22,6 +25,7 @@ from taichi_msm.accuracy.divergence import displacement_bound
 from taichi_msm.accuracy.mesh import MIN_POINTS_PER_SIDE, interpolate, with_points
 from taichi_msm.accuracy.time_step import max_norm
 from taichi_msm.errors import ProgressCallback
+from taichi_msm.integrators import INTEGRATORS
 from taichi_msm.load import cost
 from taichi_msm.model.plan import Plan
 from taichi_msm.model.time_grid import Precision
@@ -36,7 +40,6 @@ from taichi_msm.system import process
 from taichi_msm.system.runtime import Device
 
 PRECISIONS: tuple[Precision, ...] = ("f64", "f32")
-DIFFERENCES = ("central", "backward")
 
 # Number of timings of every setting, in turns with the other settings of its kind.
 ROUNDS = 5
@@ -48,15 +51,7 @@ Array = NDArray[Any]
 
 
 class SteppingStudy:
-    """Work-precision diagram of stepping.
-
-    Args:
-        plan: plan of the scene.
-        device: device of the simulations.
-        longest_run: approximate time limit of a run [s].
-        study: receives the results; keeps the first ones after a KeyboardInterrupt from `progress`.
-        progress: called with the finished and the total number of runs.
-    """
+    """Work-precision diagram of stepping."""
 
     def __init__(
         self, plan: Plan, device: Device, longest_run: float, study: Study, progress: ProgressCallback
@@ -65,7 +60,7 @@ class SteppingStudy:
         self._study, self._progress = study, progress
         self._plans = {
             difference: plan_variant(plan, with_time(plan.scene, damping_difference=difference, step="auto"))
-            for difference in DIFFERENCES
+            for difference in INTEGRATORS
         }
         self._dynamics: dict[str, Dynamics] = {}
         self._done, self._total = 0, 1
@@ -73,18 +68,16 @@ class SteppingStudy:
     def run(self) -> Array:
         """Compute the reference and the errors, then repeat every run to measure its time.
 
-        Returns:
-            Reference displacements at every frame but the first [m], shape (F, rows, cols, 3).
+        Return the reference displacements at every frame but the first [m], shape (F, rows, cols, 3).
         """
         with ExitStack() as opened:
             for precision in PRECISIONS:
                 self._progress(0, self._total)
-                dynamics = opened.enter_context(
-                    closing(Dynamics(self._plan.with_grid(precision=precision), self._device))
-                )
+                plan = self._plan.with_grid(precision=precision)
+                dynamics = opened.enter_context(closing(Dynamics(plan, self._device)))
                 dynamics.compile()
                 self._dynamics[precision] = dynamics
-            series = {difference: list(self._series(difference)) for difference in DIFFERENCES}
+            series = {difference: list(self._series(difference)) for difference in INTEGRATORS}
             finest = max(steps for counts in series.values() for steps in counts)
             self._total = 3 + ROUNDS * len(PRECISIONS) * sum(len(counts) for counts in series.values())
             frames = self._compute_reference(finest)
@@ -177,20 +170,13 @@ class _MeshRun(NamedTuple):
 
 
 class MeshStudy:
-    """Work-precision diagram of the mesh of a sheet of tissue, in f64.
+    """Work-precision diagram of the mesh of a sheet of tissue, in f64, from coarse to fine.
 
     Errors are measured with the same step for all meshes, so that time-step errors cancel, and times with the automatic
     step of each mesh, which is longer for a coarser one.
 
     The reference is extrapolated from a mesh finer than all measured ones if a run of it takes at most `ROUNDS` times
     `longest_run`, otherwise from the finest measured mesh, whose own error is then only a bound.
-
-    Args:
-        plan: plan of the scene.
-        device: device of the simulations.
-        longest_run: approximate time limit of a run [s].
-        study: receives the results from coarse to fine; keeps the first ones after a KeyboardInterrupt from `progress`.
-        progress: called with the finished and the total number of runs.
     """
 
     def __init__(
@@ -306,11 +292,10 @@ def mesh_plans(plan: Plan) -> Iterator[Plan]:
     """Yield the plans of valid coarser meshes, from coarse to fine, and of the scene's own mesh."""
     for ratio in (1 / 4, 1 / 2):
         points = _scaled(plan, ratio)
-        coarse, _ = (
-            try_plan(with_points(plan.scene, points), plan.maps) if min(points) >= MIN_POINTS_PER_SIDE else (None, [])
-        )
-        if coarse is not None:
-            yield coarse
+        if min(points) >= MIN_POINTS_PER_SIDE:
+            coarse, _ = try_plan(with_points(plan.scene, points), plan.maps)
+            if coarse is not None:
+                yield coarse
     if min(plan.scene.sheet.points) >= MIN_POINTS_PER_SIDE:
         yield plan
 
@@ -339,10 +324,7 @@ def _reference(fields: list[Array], *, extrapolate: bool) -> tuple[Array, float]
 
 def _correction(fine: Array, coarse: Array) -> Array:
     """Return Richardson's correction at the mass points of the coarse field."""
-    ratio = min(
-        (fine_count - 1) / (coarse_count - 1)
-        for fine_count, coarse_count in zip(fine.shape[:2], coarse.shape[:2], strict=True)
-    )
+    ratio = min((n - 1) / (m - 1) for n, m in zip(fine.shape[:2], coarse.shape[:2], strict=True))
     correction: Array = (interpolate(fine, coarse) - coarse) / (ratio**2 - 1)
     return correction
 
@@ -359,15 +341,9 @@ Picture = NDArray[np.uint8]
 def measure_pictures(
     scene: Scene, position: NDArray[Any], texture: Picture, quick: bool, study: Study, progress: ProgressCallback
 ) -> None:
-    """Measure the error and the time of drawing with every refinement and supersampling.
+    """Measure the errors and times of drawing with all `render_settings`.
 
-    Args:
-        scene: the scene.
-        position: positions of the mass points [m], shape (rows, cols, 3).
-        texture: picture on the sheet, 8-bit RGB, shape (height, width, 3).
-        quick: whether to vary only one of refinement and supersampling at a time.
-        study: receives the results.
-        progress: called with the finished and the total number of pictures.
+    `position` are those of the mass points [m], shape (rows, cols, 3).
     """
     position = np.ascontiguousarray(position, np.float32)
     memory = process.available_memory() // 2
@@ -400,12 +376,7 @@ def measure_pictures(
 
 
 def render_settings(scene: Scene, quick: bool) -> Iterator[tuple[int, int]]:
-    """Yield the pairs of refinement and supersampling to compare.
-
-    Args:
-        scene: scene whose own settings are included.
-        quick: whether to vary only one of the two at a time.
-    """
+    """Yield the pairs of refinement and supersampling to compare; if `quick`, those with one of the scene's two."""
     render = scene.render
     for supersample in sorted({*SUPERSAMPLES, render.supersample}):
         for refine in sorted({*REFINES, render.refine}):
@@ -414,15 +385,7 @@ def render_settings(scene: Scene, quick: bool) -> Iterator[tuple[int, int]]:
 
 
 def psnr(picture: Picture, reference: Picture) -> float | None:
-    """Compute the peak signal-to-noise ratio [dB], 10 log10(255^2 / mean square error).
-
-    Args:
-        picture: 8-bit RGB, shape (height, width, 3).
-        reference: picture of the same shape.
-
-    Returns:
-        The ratio [dB]; None if both pictures are equal.
-    """
+    """Return the peak signal-to-noise ratio [dB], 10 log10(255^2 / mean square error); None for equal pictures."""
     square = float(np.mean((picture.astype(np.float64) - reference) ** 2))
     return 10 * math.log10(255**2 / square) if square > 0 else None
 

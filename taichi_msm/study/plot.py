@@ -20,6 +20,7 @@ from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 from matplotlib.transforms import offset_copy
 
 from taichi_msm.errors import printable
+from taichi_msm.integrators import INTEGRATORS
 from taichi_msm.plot_style import (
     BLUE,
     DPI,
@@ -39,7 +40,7 @@ from taichi_msm.study.result import DrawingMeasurement, Study
 from taichi_msm.system.compiler import compiler_label
 
 # Colours encode the damping difference, dashes and markers the precision.
-DIFFERENCE_COLOURS = {"central": BLUE, "backward": VERMILION}
+DIFFERENCE_COLOURS = dict(zip(INTEGRATORS, (BLUE, VERMILION, GREEN, PURPLE), strict=False))
 PRECISION_LINES: dict[str, dict[str, Any]] = {
     "f32": {"linestyle": "-", "marker": "o"},
     "f64": {"linestyle": (0, (3.5, 1.8)), "marker": "s"},
@@ -58,12 +59,7 @@ Panel = Callable[[Axes, Study], None]
 
 
 def plot(study: Study, path: Path) -> None:
-    """Plot the measured parts of a study.
-
-    Args:
-        study: results with data for at least one panel.
-        path: path of the PNG.
-    """
+    """Plot the measured parts of a study, at least one panel, as a PNG."""
     with style.context(STYLE, after_reset=True), warnings.catch_warnings():
         # The name of a scene may contain characters that the font lacks.
         warnings.filterwarnings("ignore", "Glyph .* missing")
@@ -88,10 +84,8 @@ def _drawable(value: float | None) -> bool:
 def _figure(study: Study) -> Figure:
     study_panels = list(panels(study))
     layout = PANEL_MOSAICS[len(study_panels)]
-    size = (
-        TWO_COLUMN_WIDTH if len(study_panels) > 1 else ONE_COLUMN_WIDTH,
-        4.2 * (layout.count(";") + 1) + 0.5,
-    )
+    width = TWO_COLUMN_WIDTH if len(study_panels) > 1 else ONE_COLUMN_WIDTH
+    size = width, 4.2 * (layout.count(";") + 1) + 0.5
     figure = Figure(figsize=size, dpi=DPI, layout=ConstrainedLayoutEngine(w_pad=0.1, h_pad=0.1, wspace=0.05))
     FigureCanvasAgg(figure)
     state = " (interrupted)" if study.status == "interrupted" else ""

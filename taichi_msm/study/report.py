@@ -40,15 +40,8 @@ def require_writable(directory: Path) -> None:
 def write_report(study: Study, directory: Path) -> list[str]:
     """Write the report of a study, in place of an earlier one; other files in the directory remain.
 
-    Args:
-        study: the results; receives a note if the figure cannot be plotted.
-        directory: directory of the report.
-
-    Returns:
-        Names of the files, each written atomically, study.json last.
-
-    Raises:
-        FilesError: when the directory cannot be written.
+    Return the names of the files, each written atomically, study.json last. The study receives a note if the figure
+    cannot be plotted.
     """
     with writing(directory), hidden_folder(directory) as hidden:
         outputs = [*([PICTURE_FILE] if _draw(study, hidden / PICTURE_FILE) else []), PAGE_FILE, RECORD_FILE]

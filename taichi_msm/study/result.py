@@ -221,8 +221,7 @@ class Study:
 def observed_orders(points: list[SteppingMeasurement]) -> dict[str, float | None]:
     """Fit the order of convergence of every method to its errors, except bounds and those with significant rounding.
 
-    Returns:
-        Order by method; None with fewer than three such errors.
+    It is None with fewer than three such errors.
     """
     orders: dict[str, float | None] = {}
     for method in dict.fromkeys(point.method for point in points):

@@ -30,25 +30,12 @@ def run_study(
     threads: int | None = None,
     progress: StageProgressCallback = lambda stage, done, total: None,
 ) -> Study:
-    """Measure the cost and the error of the settings of a scene on this machine.
+    """Measure the cost and the error of the settings of a scene on this machine; `name` is the scene's in the report.
 
-    Args:
-        scene: the scene or its plan.
-        name: name of the scene in the report.
-        tolerance: largest allowed error, as a fraction of the largest displacement; by default the scene's, else 1e-3.
-        quick: whether to make fewer and shorter measurements.
-        arch: cpu, cuda or vulkan.
-        threads: number of CPU threads, by default one per core.
-        progress: called with the stage, and the finished and total number of runs or pictures; a KeyboardInterrupt from
-            it ends the study with the results so far.
-
-    Returns:
-        The measurements.
-
-    Raises:
-        SceneError: when the scene is quasi-static, the picture cannot be decoded, or the trajectories do not fit in
-            memory.
-        DeviceError: when the arch is not available.
+    `tolerance` is the largest allowed error, as a fraction of the largest displacement; by default the scene's, else
+    1e-3. If `quick`, measurements are fewer and shorter. A KeyboardInterrupt from `progress` ends the study with the
+    results so far. A quasi-static scene, an invalid picture, or trajectories that do not fit in memory raise a
+    SceneError.
     """
     plan, device = check_scene(scene), runtime.start(arch, threads)
     scene = plan.scene

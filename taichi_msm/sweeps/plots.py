@@ -32,8 +32,9 @@ from taichi_msm.errors import FilesError, StageProgressCallback, printable
 from taichi_msm.plot_style import BLUE, DPI, GREY, INK, ONE_COLUMN_WIDTH, ORANGE, PALE, STYLE, VERMILION
 from taichi_msm.runs.directory import replacing
 from taichi_msm.runs.finished import read_run, reading
+from taichi_msm.sweeps.distribution import Distribution
 from taichi_msm.sweeps.runs import POLL_INTERVAL_S, SweepState
-from taichi_msm.sweeps.spec import Distribution, spread
+from taichi_msm.sweeps.spec import spread
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -426,12 +427,12 @@ def is_wide_range(numbers: NDArray[np.float64]) -> bool:
 
 def _parameters(name: str, distribution: Distribution, values: Sequence[Any]) -> Iterator[VariedParameter]:
     """Yield the parameters of a key, one for each component of a list of numbers."""
-    if distribution.kind not in ("choice", "grid"):
+    if distribution.continuous:
         components = np.array(values, dtype=np.float64)
         columns = components.reshape(len(values), -1).T
         for index, numbers in zip(np.ndindex(components.shape[1:]), columns, strict=True):
             suffix = "".join(f"[{n}]" for n in index)
-            yield VariedParameter(name + suffix, numbers, distribution.kind == "log_uniform")
+            yield VariedParameter(name + suffix, numbers, distribution.continuous.logarithmic)
         return
     if all(type(value) in (int, float) for value in distribution.values):
         numbers = np.array(values, dtype=np.float64)

@@ -1,4 +1,4 @@
-"""Sweep files: checks, distributions of keys and variables, and values of the runs."""
+"""Sweep files: checks, and values of the runs."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ import keyword
 import math
 import os
 import re
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import suppress
 from copy import deepcopy
 from dataclasses import dataclass
@@ -17,7 +17,7 @@ from glob import glob
 from pathlib import Path
 from typing import Annotated, Any
 
-from pydantic import ConfigDict, Field, field_validator, model_validator
+from pydantic import Field, field_validator, model_validator
 from typing_extensions import Self
 
 from taichi_msm.errors import ArgumentError, Key, Problem, SceneError, truncate
@@ -26,16 +26,8 @@ from taichi_msm.load import scene_file
 from taichi_msm.load.check import parse_model
 from taichi_msm.load.yaml_reader import UnreadableError, read_yaml
 from taichi_msm.scene.scene import Scene
-from taichi_msm.scene.section import (
-    MAX_MAGNITUDE,
-    MAX_PATH,
-    FilePath,
-    Integer,
-    Section,
-    format_value,
-    key,
-    scene_fault,
-)
+from taichi_msm.scene.section import MAX_PATH, FilePath, Integer, Section, format_value, key, scene_fault
+from taichi_msm.sweeps.distribution import Distribution, numbers
 from taichi_msm.sweeps.expressions import CONSTANTS, FUNCTIONS, ExpressionError, evaluate, replace_expressions
 
 # Columns of table.csv between the varied keys and the forces of probes.
@@ -48,138 +40,6 @@ MAX_FOLDERS = 100
 
 # Limit of SciPy's Sobol sequences.
 MAX_DIMENSIONS = 21201
-
-RANGE = "[low, high]: numbers, or lists of one shape"
-LIST = "a list of values that is not empty"
-NonEmptyList = Annotated[list[Any], Field(min_length=1)]
-
-
-class Distribution(Section):
-    """Distribution of a varied key, by exactly one field; lists of numbers vary componentwise."""
-
-    model_config = ConfigDict(validate_default=False)
-
-    uniform: Any = key(None, "between two numbers", RANGE)
-    log_uniform: Any = key(None, "between two numbers above 0, uniform in the logarithm", RANGE)
-    normal: Any = key(None, "normally distributed", "[mean, standard deviation]: numbers, or lists of one shape")
-    choice: NonEmptyList = key(
-        None, "one of some values, all equally likely; of a picture also a pattern of files", LIST
-    )
-    grid: NonEmptyList = key(None, "every one of some values, with every combination of the other keys'", LIST)
-
-    @model_validator(mode="before")
-    @classmethod
-    def _is_mapping(cls, data: Any) -> Any:
-        if not isinstance(data, dict):
-            remedy = "take one such as {uniform: [1, 2]} or {choice: [1, 2]}"
-            raise scene_fault(f"{format_value(data)} is not a distribution; {remedy}")
-        if data.keys().isdisjoint(cls.model_fields) and any(isinstance(value, dict) for value in data.values()):
-            raise scene_fault("give each key by its dotted path, such as tissue.young: {uniform: [1e4, 3e4]}")
-        return data
-
-    @field_validator("uniform", "log_uniform", "normal")
-    @classmethod
-    def _is_pair(cls, value: Any) -> Any:
-        is_pair = isinstance(value, list) and len(value) == 2 and all(map(_numbers, value))
-        if not is_pair or _shape(value[0]) != _shape(value[1]):
-            raise ValueError
-        return value
-
-    @field_validator("uniform", "log_uniform")
-    @classmethod
-    def _is_ordered(cls, value: Any) -> Any:
-        for low, high in zip(_numbers(value[0]), _numbers(value[1]), strict=True):
-            if low > high:
-                raise scene_fault(f"{low:g} is above {high:g}; give the lower number first")
-        return value
-
-    @field_validator("log_uniform")
-    @classmethod
-    def _is_positive(cls, value: Any) -> Any:
-        if (low := min(_numbers(value[0]))) <= 0:
-            raise scene_fault(f"{low:g} has no logarithm; take numbers above 0, or uniform")
-        return value
-
-    @field_validator("normal")
-    @classmethod
-    def _has_deviation(cls, value: Any) -> Any:
-        if (deviation := min(_numbers(value[1]))) < 0:
-            raise scene_fault(f"a standard deviation of {deviation:g} is not possible; take 0 or more")
-        return value
-
-    @field_validator("choice", "grid")
-    @classmethod
-    def _is_finite(cls, value: Any) -> Any:
-        try:
-            json.dumps(value, allow_nan=False)
-        except ValueError:
-            raise scene_fault(f"{format_value(value)} has an infinite number or NaN; take finite ones") from None
-        return value
-
-    @model_validator(mode="after")
-    def _has_one_field(self) -> Self:
-        if len(self.model_fields_set) != 1:
-            raise scene_fault(f"expected one of {', '.join(type(self).model_fields)}")
-        return self
-
-    @property
-    def kind(self) -> str:
-        """Name of the field that is set."""
-        return next(iter(self.model_fields_set))
-
-    @property
-    def values(self) -> Any:
-        """Value of the field: two parameters, or the values of a choice or grid."""
-        return getattr(self, self.kind)
-
-    @property
-    def dimensions(self) -> int:
-        """Number of fractions for `value`: one per number, one for a choice, none for a grid."""
-        if self.kind in ("choice", "grid"):
-            return int(self.kind == "choice")
-        return len(_numbers(self.values[0]))
-
-    def value(self, fractions: Sequence[float]) -> Any:
-        """Return the value of fractions in [0, 1), by the quantile function; shape (dimensions,)."""
-        if self.kind == "choice":
-            return self.values[int(fractions[0] * len(self.values))]
-        remaining = iter(fractions)
-        return _map_pairs(lambda first, second: _quantile(self.kind, first, second, next(remaining)), *self.values)
-
-
-def _quantile(kind: str, first: float, second: float, fraction: float) -> float:
-    """Return the quantile at a fraction of a distribution with two parameters."""
-    if kind == "normal":
-        from scipy.special import ndtri
-
-        # Sobol points are multiples of 2^-30 and include 0, where the quantile is infinite.
-        return first + second * float(ndtri(max(fraction, 2.0**-31)))
-    if kind == "log_uniform":
-        low, high = math.log(first), math.log(second)
-        # Rounded values could be outside the interval.
-        return min(max(math.exp(low + (high - low) * fraction), first), second)
-    return first + (second - first) * fraction
-
-
-def _map_pairs(function: Callable[[float, float], float], first: Any, second: Any) -> Any:
-    """Apply a function to the pairs of corresponding numbers in two values of one shape."""
-    if isinstance(first, list):
-        return list(map(partial(_map_pairs, function), first, second))
-    return float(function(first, second))
-
-
-def _numbers(value: Any) -> list[float]:
-    """Return all numbers in nested lists; empty if they contain anything else."""
-    if isinstance(value, list):
-        parts = [_numbers(item) for item in value]
-        return [number for part in parts for number in part] if all(parts) else []
-    is_number = isinstance(value, (int, float)) and not isinstance(value, bool) and abs(value) <= MAX_MAGNITUDE
-    return [value] if is_number else []
-
-
-def _shape(value: Any) -> Any:
-    """Return nested lists with None in place of each number, for comparisons of shapes."""
-    return [_shape(item) for item in value] if isinstance(value, list) else None
 
 
 class SweepSettings(Section):
@@ -236,7 +96,7 @@ class SweepSettings(Section):
             ):
                 raise scene_fault("is not a valid name; take letters, digits and _, such as x1", name)
             for value in distribution.values:
-                if isinstance(value, list) or not _numbers(value):
+                if isinstance(value, list) or not numbers(value):
                     raise scene_fault(
                         f"{format_value(value)} is not a number; variables are numbers", name, distribution.kind
                     )
@@ -262,8 +122,8 @@ class SweepSettings(Section):
             raise scene_fault(
                 f"{self.runs} combinations, more than the {MAX_RUNS} that can be run; take smaller grids", "vary"
             )
-        if (numbers := sum(distribution.dimensions for distribution in varied.values())) > MAX_DIMENSIONS:
-            raise scene_fault(f"{numbers} numbers, more than the {MAX_DIMENSIONS} that can vary; take fewer", "vary")
+        if (count := sum(distribution.dimensions for distribution in varied.values())) > MAX_DIMENSIONS:
+            raise scene_fault(f"{count} numbers, more than the {MAX_DIMENSIONS} that can vary; take fewer", "vary")
         keys = [_split_key(name) for name in (*self.set, *self.vary)]
         for number, later in enumerate(keys):
             if replaced := [earlier for earlier in keys[:number] if earlier[: len(later)] == later]:

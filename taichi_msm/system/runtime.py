@@ -12,7 +12,7 @@ import threading
 import time
 import weakref
 from collections import defaultdict
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -20,7 +20,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from taichi_msm.arithmetic import Operations
 from taichi_msm.errors import MAX_WORKERS, ArgumentError, DeviceError, MsmError, did_you_mean
 from taichi_msm.system.compiler import Patches, active_compiler
 from taichi_msm.system.files import private_folder
@@ -104,23 +103,6 @@ def lanes(precision: str) -> int:
 def vector_bits() -> int:
     """Return the width of the processor's vector registers [bits]."""
     return next((bits for feature, bits in (("AVX512F", 512), ("AVX2", 256)) if _features.get(feature)), 128)
-
-
-def kernel_operations(vector: Any = None) -> Operations:
-    """Return the operations of a kernel, for vectors of a type and numbers, or for numbers alone."""
-
-    def lanewise(function: Callable[..., Any]) -> Callable[..., Any]:
-        @ti.func
-        def apply(values):  # type: ignore[no-untyped-def]
-            result = values + vector(0)
-            for lane in ti.static(range(vector.n)):
-                result[lane] = function(result[lane])
-            return result
-
-        return function if vector is None else apply
-
-    log, exp, arctan = (lanewise(function) for function in (ti.log, ti.exp, lambda value: ti.atan2(value, 1.0)))
-    return Operations(ti.sqrt, log, exp, arctan, ti.max, ti.min, ti.select, ti.func, ti.lang.impl.expr_init)
 
 
 def current_device() -> Device:

@@ -233,10 +233,10 @@ class KernelConfig:
 
     @property
     def operations(self) -> Operations:
-        """The operations of vectors, for laws and shapes."""
-        from taichi_msm.system.runtime import kernel_operations
+        """The operations of kernels, imported lazily as `ti`."""
+        from taichi_msm.system.kernel_operations import KERNEL
 
-        return kernel_operations(self.vector)
+        return KERNEL
 
     def get(self, kind: type[AnyTerm]) -> AnyTerm | None:
         """Return the term of a class; None if the scene does not have it."""

@@ -8,7 +8,7 @@ friction mu reduces their slip; u' and c' are those before the step:
     slip = (u + depth n - u') - (c - c'),    w = slip - (slip . n) n
     correction = depth n - w min(1, mu depth / |w|)
 
-A correction has the effect of the force correction / gain (`model.verlet`), so the corrections yield the force of the
+A correction has the effect of the force correction / gain (`integrators`), so the corrections yield the force of the
 tool.
 
 A grip holds the mass points within 1.5 radii of the tip's centre at its start: u = u_start + c - c_start. A clamp, a
@@ -32,7 +32,6 @@ import numpy as np
 from numpy.typing import NDArray
 from typing_extensions import Self
 
-from taichi_msm.model import verlet
 from taichi_msm.model.loads import Schedule
 from taichi_msm.model.plan import Plan
 from taichi_msm.model.tools import GRIP_RADII, Clamp
@@ -97,7 +96,7 @@ class ContactTerm(Term):
     def columns(self, plan: Plan, loads: Schedule, first: int) -> NDArray[Any]:
         grid, steps = plan.grid, first + np.arange(len(loads.active) + 1)
         t, frame = steps / grid.steps_per_second, 1 / grid.frames_per_second
-        _, gain, first_gain = verlet.coefficients(plan)
+        _, gain, first_gain = plan.step_coefficients
         columns = np.zeros((len(loads.active), self.column_count))
         # The first step has another gain, so the force of its corrections differs.
         columns[:, WEIGHT] = np.where(steps[:-1] == 0, gain / first_gain, 1.0)

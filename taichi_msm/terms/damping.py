@@ -1,4 +1,4 @@
-"""Damping: the force -C v on every mass point, part of the update rule (`model.verlet`).
+"""Damping: the force -C v on every mass point, part of the update rule (`integrators`).
 
 Scene: `damping`, or `tissue.damping`.
 """
@@ -12,14 +12,13 @@ from typing import Any, ClassVar
 from typing_extensions import Self
 
 from taichi_msm.model.plan import Plan
-from taichi_msm.model.verlet import coefficients
 from taichi_msm.scene.scene import Scene
 from taichi_msm.terms.base import KernelConfig, Term
 
 
 @dataclass(frozen=True)
 class DampingTerm(Term):
-    """Damping. It stores no energy; `verlet.stability_limit` includes its effect on the stable step."""
+    """Damping. It stores no energy; an integrator includes its effect on the stable step."""
 
     has_gradient: ClassVar[bool] = True
     constant_count: ClassVar[int] = 1
@@ -39,7 +38,7 @@ class DampingTerm(Term):
         return cls() if plan.material.drag > 0 else None
 
     def constants(self, plan: Plan) -> tuple[float, ...]:
-        return (coefficients(plan).keep,)
+        return (plan.step_coefficients.keep,)
 
     def build_damping(self, config: KernelConfig) -> Sequence[Callable[..., Any]]:
         ti, keep = config.ti, config.first_constant(DampingTerm)

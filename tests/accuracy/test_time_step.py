@@ -14,8 +14,8 @@ from taichi_msm.accuracy import time_step
 from taichi_msm.accuracy.companions import coarse_steps, fine_steps
 from taichi_msm.accuracy.time_step import TimeStepEstimate, TimeStepTrials, choose_step, max_norm
 from taichi_msm.errors import SceneError
+from taichi_msm.integrators import INTEGRATORS, Coefficients
 from taichi_msm.model.plan import Plan
-from taichi_msm.model.verlet import convergence_order
 from taichi_msm.scene.scene import Scene
 from taichi_msm.solver.planning import with_time
 from taichi_msm.solver.state import RunProgress
@@ -91,6 +91,25 @@ def test_estimate_against_the_true_error(kind: str, difference: str, device: Dev
         # The next power of h is (w h)^2 / 24 of the error at most, w h <= 1; and twice that for the kinks of the load.
         assert estimate.error == pytest.approx(error, rel=1 / 12)
     assert ("velocities change their sign" in "".join(notes_of(made, MOVED, None))) == kind.startswith("damping")
+
+
+def test_an_integrator_owns_its_order(monkeypatch: pytest.MonkeyPatch, device: Device) -> None:
+    """The semi-implicit Euler method has the full gain in step 0, which is an error h F / (2 m) of the velocity."""
+    central = INTEGRATORS["central"]
+
+    def coefficients(m: float, g: float, h: float) -> Coefficients:
+        keep, gain, _ = central.coefficients(m, g, h)
+        return Coefficients(keep, gain, gain)
+
+    euler = central._replace(coefficients=coefficients, order=lambda _: 1)
+    made = scene(**SUDDEN, damping=0, time={"precision": "f64"})
+    reference = frames(made, device, cut=64 * plan_of(made).grid.steps_per_frame)
+    monkeypatch.setitem(INTEGRATORS, "central", euler)
+    estimate = estimate_error(plan_of(made), device)
+    error = max_norm(frames(made, device) - reference) / max_norm(reference)
+    assert estimate.order == 1
+    # The next power of h is the error of order 2, (w h)^2 / 24 with w h <= 1.
+    assert estimate.error == pytest.approx(error, rel=1 / 8)
 
 
 class PowerLaw:
@@ -193,8 +212,8 @@ def test_damping_within_a_hundredth_of_a_step_has_no_estimate(device: Device, me
 
 def test_order_with_backward_differences() -> None:
     backward = {"damping_difference": "backward"}
-    assert convergence_order(plan_of(scene(time=backward))) == 1
-    assert convergence_order(plan_of(scene(time=backward, damping=0))) == 2
+    assert plan_of(scene(time=backward)).convergence_order == 1
+    assert plan_of(scene(time=backward, damping=0)).convergence_order == 2
 
 
 @pytest.mark.parametrize(
@@ -210,7 +229,7 @@ def test_order_with_backward_differences() -> None:
 def test_order_2_with_jumps_between_steps(probe: dict[str, Any], device: Device) -> None:
     """By regression over steps that meet none of the jumps, against a run of many steps."""
     made = scene(probes=[{**SOFT_PRESS, **probe}], damping=0.02)
-    assert convergence_order(plan_of(made)) == 2
+    assert plan_of(made).convergence_order == 2
     counts = (20, 40, 80, 160)
     exact = frames(made, device, cut=1280)
     errors = [max_norm(frames(made, device, cut=count) - exact) / max_norm(exact) for count in counts]

@@ -16,8 +16,13 @@ from PIL import Image, ImageCms
 
 from taichi_msm.errors import SceneError
 from taichi_msm.images import PictureError, file_sha256, read_grey
+from taichi_msm.model import sheet
+from taichi_msm.model.sheet import read_map
+from taichi_msm.render import shading, texture
+from taichi_msm.render.shading import pyramid
 from taichi_msm.render.texture import image_problems, image_size, load_texture
 from taichi_msm.scene.scene import Scene
+from taichi_msm.scene.sheet import StiffnessMap
 from tests import scenes
 from tests.golden import Messages
 from tests.scenes import speckle
@@ -306,3 +311,45 @@ def test_warnings_of_pillow_are_discarded() -> None:
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         load_texture(scene("a.jpg"))
+
+
+def test_decoded_pictures_are_cached_until_the_file_changes(monkeypatch: pytest.MonkeyPatch) -> None:
+    Image.fromarray(COLOURS).save("a.png")
+    first, grey_map = load_texture(scene("a.png")), read_map(StiffnessMap(image="a.png", range=(1, 2)))
+    assert not first.flags.writeable
+    assert not grey_map.grey.flags.writeable
+    assert_texture("a.png", COLOURS[:1], region=[0, 0, 3, 1])
+    status, changed = Path("a.png").stat(), COLOURS.copy()
+    changed[0, 0] = 7, 8, 9
+    Path("copy.png").write_bytes(Path("a.png").read_bytes())
+    Image.fromarray(changed).save("a.png")
+    os.utime("a.png", ns=(status.st_atime_ns, status.st_mtime_ns))
+    assert_texture("a.png", changed)
+    assert read_map(StiffnessMap(image="a.png", range=(1, 2))).grey[0, 0] == Image.open("a.png").convert("L").getpixel(
+        (0, 0)
+    )
+    with monkeypatch.context() as patch:
+        patch.setattr(texture, "read_rgb", pytest.fail)
+        patch.setattr(sheet, "read_grey", pytest.fail)
+        assert load_texture(scene("copy.png")) is first
+        assert read_map(StiffnessMap(image="copy.png", range=(1, 2))).grey is grey_map.grey
+        assert_texture("a.png", changed)
+    # A required digest is compared with the file, not with the cache.
+    with pytest.raises(SceneError, match="differs from the file of the run"):
+        load_texture(scene("a.png"), file_sha256("copy.png"))
+
+
+def test_mipmap_levels_are_cached(monkeypatch: pytest.MonkeyPatch) -> None:
+    colours = speckle(9, 14)
+    levels = pyramid(colours, minified=True)
+    expected = shading._build_pyramid(colours, minified=True)
+    for cached, built in zip(levels, expected, strict=True):
+        np.testing.assert_array_equal(cached, built)
+        assert not cached.flags.writeable
+    assert len(pyramid(colours, minified=False)[1]) == 1
+    assert len(pyramid(colours.reshape(14, 9, 3), minified=True)[1]) == len(levels[1])
+    colours[0, 0] ^= 1
+    assert pyramid(colours, minified=True)[0][0] != levels[0][0]
+    colours[0, 0] ^= 1
+    monkeypatch.setattr(shading, "_build_pyramid", pytest.fail)
+    assert pyramid(colours, minified=True)[0] is levels[0]

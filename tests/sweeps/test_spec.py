@@ -13,14 +13,15 @@ import numpy as np
 import pytest
 from PIL import Image
 from scipy.special import ndtri
-from scipy.stats import qmc
+from scipy.stats import qmc, triang
 
 from taichi_msm.errors import SceneError
 from taichi_msm.load.scene_file import load_plan, names_file, parse_override, plan_file
 from taichi_msm.scene.scene import Scene
 from taichi_msm.scene.section import MAX_PATH
+from taichi_msm.sweeps.distribution import CONTINUOUS, Continuous, Distribution
 from taichi_msm.sweeps.expressions import evaluate
-from taichi_msm.sweeps.spec import Distribution, Sweep, SweepSettings, format_override, load_sweep, make_sweep
+from taichi_msm.sweeps.spec import Sweep, SweepSettings, format_override, load_sweep, make_sweep
 from tests.golden import Messages
 from tests.scenes import speckle
 from tests.sweeps.conftest import CALIBRATION, POSES
@@ -57,6 +58,22 @@ def test_dimensions_in_the_order_of_the_keys() -> None:
         assert row[1] == pytest.approx([100 ** u[1], 10.0], rel=1e-14)
         assert row[2] == "xyz"[int(3 * u[3])]
         assert row[3] == pytest.approx(1 + 0.5 * ndtri(u[4]), rel=1e-14)
+
+
+def test_distribution_of_three_parameters(monkeypatch: pytest.MonkeyPatch) -> None:
+    """SciPy's triangular distribution: a quarter of the samples are below the mode of [0, 1, 4]."""
+
+    def quantile(fraction: float, low: float, mode: float, high: float) -> float:
+        return float(triang((mode - low) / (high - low), low, high - low).ppf(fraction))
+
+    row = Continuous("triangular", ("low", "mode", "high"), quantile, lambda low, mode, high: "" if mode else "mode 0")
+    monkeypatch.setitem(CONTINUOUS, "normal", row)
+    distribution = Distribution(normal=[[0, 1], [1, 5], [4, 9]])
+    assert distribution.dimensions == 2
+    assert distribution.value([0.25, 0.5]) == pytest.approx([1, 5], rel=1e-14)
+    for parameters in ([0, 4], [0, 1, [4]], [0, 0, 4]):
+        with pytest.raises(SceneError):
+            Distribution(normal=parameters)
 
 
 def test_more_samples_extend_the_sequence() -> None:
