@@ -52,9 +52,7 @@ def _backward(m: float, g: float, h: float) -> Coefficients:
 def stability_limit(frequency: float, g: float = 0.0) -> float:
     """Return Verlet's largest stable step (sqrt(g^2 + 4 w^2) - g) / w^2 [s], without cancellation.
 
-    Args:
-        frequency: highest angular frequency w [rad/s].
-        g: C / m [1/s] of backward differences of the damping; 0 for central ones.
+    w is the frequency [rad/s]; g is C / m [1/s] of backward differences of the damping, 0 for central ones.
     """
     limit = math.hypot(g, 2 * frequency) + g
     return 4 / limit if limit > 0 else math.inf

@@ -21,9 +21,7 @@ _lock = Lock()
 def cached_arrays(key: Hashable, compute: Callable[[], tuple[NDArray[Any], ...]]) -> tuple[NDArray[Any], ...]:
     """Return the arrays of a key, read-only; beyond the limits, the least recently used ones are dropped.
 
-    Args:
-        key: name of the function, and digests and values on which its result depends.
-        compute: computes the arrays, unless they are cached.
+    The key contains the name of the function, and digests and values on which its result depends.
     """
     arrays = _arrays.get(key) or compute()
     for array in arrays:
