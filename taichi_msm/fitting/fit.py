@@ -203,7 +203,7 @@ def _fit(runs: Runs, scene: Scene, method: Method) -> FitResult:
     values = {key: estimate.value for key, estimate in estimates.items()}
     measures_forces = any(observed.noun == "forces" for observed in observations)
     unidentified = unidentified_groups(parameters, solution.x, uncertainties, forces=measures_forces)
-    rejection_reason = _rejection(misfit, solution, uncertainties, error_correlation)
+    rejection_reason = _rejection(scene, misfit, solution, uncertainties, error_correlation)
     tests = fitted_tests(machine, values, solution.predicted.values[0]) if machine else ()
     residuals = misfit.split(misfit.difference(solution.predicted))
     summaries: dict[str, Any] = {}
@@ -299,7 +299,7 @@ def uncertainty_notes(
 
 
 def _rejection(
-    misfit: Misfit, solution: Solution, uncertainties: Uncertainty, error_correlation: ErrorCorrelation
+    scene: Scene, misfit: Misfit, solution: Solution, uncertainties: Uncertainty, error_correlation: ErrorCorrelation
 ) -> str | None:
     """Return the reason for rejecting the model, or None."""
     observations, parts = misfit.observations, misfit.split(uncertainties.residuals)
@@ -311,7 +311,7 @@ def _rejection(
         reason = rejection.by_chi_square(total, uncertainties.freedom, uncertainties.independent, name)
     for observed, values, part, signal in zip(observations, predictions, parts, misfit.signals, strict=True):
         if reason is None and observed.sigma is None:
-            reason = observed.pattern(values - observed.values, signal, error_correlation)
+            reason = observed.pattern(scene, values, signal, error_correlation)
         elif reason is None and observed.is_independent:
             squares = float(part @ part)
             reason = rejection.by_chi_square(squares, len(part), len(part), f"{name} of the {observed.noun}")

@@ -151,11 +151,12 @@ class Observation(ABC):
         """Yield a message if another unit explains the ratio of observed values to all predictions."""
         yield from ()
 
-    def pattern(self, residuals: Array, signal: float, correlation: ErrorCorrelation) -> str | None:
+    def pattern(self, scene: Scene, predicted: Array, signal: float, correlation: ErrorCorrelation) -> str | None:
         """Return the reason to reject the model for a pattern in the residuals, or None.
 
         Args:
-            residuals: predicted minus observed values, with the shape of `values`.
+            scene: scene with the camera.
+            predicted: values predicted by the solution, with the shape of `values`.
             signal: root mean square from `signal` [unit].
             correlation: given correlation of the errors.
         """

@@ -231,9 +231,11 @@ class PointObservation(Observation):
             fault = f"the motion in {'xyz'[axis]} is opposite to the scene's; is its sign wrong, or that of the tool?"
             yield f"{self.subject}: {fault} change the sign of {'xyz'[axis]}, or of the force or path"
 
-    def pattern(self, residuals: Array, signal: float, correlation: ErrorCorrelation) -> str | None:
+    def pattern(self, scene: Scene, predicted: Array, signal: float, correlation: ErrorCorrelation) -> str | None:
+        remedy = self.correlation_remedy or "give --sigma"
+        residuals, displacement = predicted - self.values, predicted - self.at_rest(scene)
         return rejection.by_pattern(
-            residuals, self.time, self.coordinates, signal, correlation, self.correlation_remedy or "give --sigma"
+            residuals, displacement, self.time, self.coordinates, signal, correlation, remedy
         )
 
     def correlated(self, rows: Array, correlation: ErrorCorrelation) -> tuple[Array, float]:

@@ -26,6 +26,7 @@ from taichi_msm.fitting.observation import ErrorCorrelation
 from taichi_msm.fitting.parameters import Method, make_parameters
 from taichi_msm.fitting.points import MIN_MOTION_SIGMAS, Pixels, PointObservation, Positions
 from taichi_msm.fitting.predict import FitProblem, ForwardModel, Prediction, Runs, without_outputs
+from taichi_msm.fitting.rejection import by_pattern
 from taichi_msm.fitting.result import FitResult
 from taichi_msm.fitting.uncertainty import Uncertainty, unidentified_groups
 from taichi_msm.model.surface import surface_positions
@@ -732,7 +733,14 @@ CORRELATIONS = [ErrorCorrelation(None, None), ErrorCorrelation(5.0, None), Error
 @pytest.mark.parametrize("correlation", CORRELATIONS, ids=["independent", "in space", "in time"])
 def test_false_rejections_by_a_pattern(correlation: ErrorCorrelation, message: Messages) -> None:
     """Of noise with jumps and missing observations; a wrong model is rejected."""
-    rng, times = np.random.default_rng(4), np.arange(9.0)
+    rng = np.random.default_rng(4)
+
+    def reason(residuals: Array) -> str | None:
+        # The displacement grows in time, most in the middle of the sheet.
+        times = np.arange(residuals.shape[1], dtype=float)
+        displacement = np.exp(-8 * ((PLACES - 0.5) ** 2).sum(axis=1))[:, None, None] * times[:, None] * [1.0, 0.5]
+        return by_pattern(residuals, displacement, times, PLACES, 10.0, correlation, "give --correlation PX")
+
     rejections = 0
     for _ in range(400):
         residuals = rng.normal(0, 1, (36, 9, 2))
@@ -740,12 +748,25 @@ def test_false_rejections_by_a_pattern(correlation: ErrorCorrelation, message: M
         residuals = residuals if correlation.drift is None else np.cumsum(residuals, axis=1)
         residuals[rng.random(residuals.shape) < 0.05] *= 10
         residuals[rng.random(residuals.shape[:2]) < 0.1] = np.nan
-        rejections += Pixels("", times, residuals, None, PLACES).pattern(residuals, 10.0, correlation) is not None
+        rejections += reason(residuals) is not None
     # Of 400, 0.4 are expected; more than 3 have a probability of 1e-3.
     assert rejections <= 3
-    times = np.arange(40.0)
-    residuals = np.sin(times / 6)[:, None] + rng.normal(0, 1, (36, 40, 2))
-    message(Pixels("", times, residuals, None, PLACES).pattern(residuals, 10.0, correlation) or "", "correlated")
+    residuals = np.sin(np.arange(40) / 6)[:, None] + rng.normal(0, 1, (36, 40, 2))
+    message(reason(residuals) or "", "correlated")
+
+
+def test_rejection_of_a_linear_model_of_locked_tissue(device: Device, message: Messages) -> None:
+    """Its residuals are 5 % larger than the noise, and Young's modulus is wrong by a factor of 1.6."""
+    keys: dict[str, Any] = {"tissue__foundation": 1e5, "probes__0__total": [0, 0, -6]}
+    locked, linear = changed(tissue__stiffening={"lock": 0.15}, **keys), changed(tissue__young=3e4, **keys)
+    pixel = pixels_in(locked, positions_in(locked, device), device)
+    for seed in (0, 1):
+        observed = noisy({"time": TIME, "coordinates": PLACES, "pixel": pixel}, 0.5, seed)
+        wrong = estimate(linear, observed, [YOUNG])
+        assert (wrong.residual, values(wrong)[0]) == (pytest.approx(0.525, rel=0.04), pytest.approx(3.3e4, rel=0.1))
+        assert wrong.model_rejected
+        assert not estimate(locked, observed, [YOUNG]).model_rejected
+    message(wrong.summary()[0], "the model is rejected: ", hide=r"\d[\d.]*")
 
 
 @pytest.mark.parametrize("kind", [Pixels, Positions])
