@@ -25,6 +25,7 @@ from taichi_msm.fitting.machine_curve import CurveRuns, has_curve, search_by_cur
 from taichi_msm.fitting.machine_fit import explanations, fitted_tests, unknown_notes
 from taichi_msm.fitting.machine_model import TABLE_OPTIONS, MachineProblem, read_machine_problem, table_paths
 from taichi_msm.fitting.observation import Array, ErrorCorrelation, Observation
+from taichi_msm.fitting.outliers import LeftOut, leave_out
 from taichi_msm.fitting.parameters import Bounds, Method, Parameter, as_data, make_parameters, require_types, rounded
 from taichi_msm.fitting.points import PointObservation
 from taichi_msm.fitting.predict import FitProblem, Prediction, Runs, without_outputs
@@ -33,6 +34,7 @@ from taichi_msm.fitting.report import publication, write_report
 from taichi_msm.fitting.result import Estimate, FitResult, FittedMap
 from taichi_msm.fitting.stiffness_map import KEY, MapSettings, fit_map, map_settings
 from taichi_msm.fitting.uncertainty import (
+    MAX_CORRELATION,
     MAX_RELATIVE_ERROR,
     Uncertainty,
     UnidentifiedGroup,
@@ -42,6 +44,9 @@ from taichi_msm.fitting.uncertainty import (
 from taichi_msm.load.check import check_scene
 from taichi_msm.load.scene_file import load_scene
 from taichi_msm.scene.scene import Scene
+
+# Largest number of minima from which profiles start.
+MAX_MINIMA = 4
 
 
 def fit(
@@ -187,17 +192,29 @@ def _fit(runs: Runs, scene: Scene, method: Method) -> FitResult:
         if machine:
             search.remember(start, initial)
         solution = search.best(start)
+    left_out: list[LeftOut] = []
+    if misfit.robust and machine is None:
+        solution, left_out = leave_out(search, solution)
+        misfit, observations = search.misfit, search.misfit.observations
     # A wrong sign or unit contradicts both the initial and the fitted scene.
     both = initial, solution.predicted
     if messages := [*opposed(observations, scene, *both), *unit_faults(observations, *both)]:
         raise SceneError(messages)
-    uncertainties = uncertainty(misfit, solution, search.jacobian(solution), error_correlation)
-    if isinstance(runs, CurveRuns):
-        runs.by_tangent = False  # Profiles are those of curves.
-    profiles = Profiler(runs, misfit, solution, uncertainties).profiles() if method.get("profile") else None
+    profiles: dict[int, Profile] = {}
+    for remaining in reversed(range(MAX_MINIMA)):
+        uncertainties = uncertainty(misfit, solution, search.jacobian(solution), error_correlation)
+        if isinstance(runs, CurveRuns):
+            runs.by_tangent = False  # Profiles are those of curves.
+        profiler = Profiler(runs, misfit, solution, uncertainties)
+        profiles = profiler.profiles(
+            range(len(parameters)) if method.get("profile") else np.flatnonzero(uncertainties.is_correlated).tolist()
+        )
+        if profiler.lower is None or machine or not remaining:
+            break
+        solution = search.refine(profiler.lower)
     mesh_error, shifts = _mesh_effect(runs, misfit, solution, uncertainties)
     estimates = {
-        parameter.key: _estimate(parameter, float(solution.x[n]), n, uncertainties, profiles, shifts)
+        parameter.key: _estimate(parameter, float(solution.x[n]), n, uncertainties, profiles.get(n), shifts)
         for n, parameter in enumerate(parameters)
     }
     values = {key: estimate.value for key, estimate in estimates.items()}
@@ -238,10 +255,11 @@ def _fit(runs: Runs, scene: Scene, method: Method) -> FitResult:
             Scene(**machine.fitted_data(as_data(scene), values, n)) for n in range(1, len(tests)) if machine is not None
         ],
         observations=observations,
+        left_out=left_out,
         fitted=solution.predicted.values,
         tests=tests,
         curves={
-            parameter.key: _curve(parameter, n, solution.x, uncertainties, profiles)
+            parameter.key: _curve(parameter, n, solution.x, uncertainties, profiles.get(n))
             for n, parameter in enumerate(parameters)
         },
     )
@@ -291,11 +309,11 @@ def uncertainty_notes(
         shares = [(parameters[n].key, parameters[n].relative_error(x[n], float(shifts[n]))) for n in moved]
         shifted_parameters = ", ".join(f"{key} by about {rounded(100 * share)} %" for key, share in shares)
         yield f"the mesh changes {shifted_parameters}, more than the interval; take more sheet.points"
-    for n, m in zip(*np.nonzero(np.triu(np.abs(uncertainties.correlation) > 0.95, 1)), strict=True):
+    for n, m in zip(*np.nonzero(np.triu(np.abs(uncertainties.correlation) > MAX_CORRELATION, 1)), strict=True):
         keys = parameters[n].key, parameters[m].key
         if not any({*keys} <= {*group.parameters} for group in unidentified):
             fault = f"{keys[0]} and {keys[1]} correlate by {uncertainties.correlation[n, m]:.3f}"
-            yield f"{fault}: their combination is more certain than each alone"
+            yield f"{fault}: the data hardly distinguish them, so that small model errors shift both; fix one if known"
 
 
 def _rejection(
@@ -357,14 +375,14 @@ def _estimate(
     x: float,
     index: int,
     uncertainties: Uncertainty,
-    profiles: list[Profile] | None,
+    profile: Profile | None,
     shifts: Array | None,
 ) -> Estimate:
     deviation = float(uncertainties.deviations[index])
     half_width = uncertainties.quantile * deviation
     ends: tuple[float | None, float | None] = (x - half_width, x + half_width)
-    if profiles is not None:
-        ends = profiles[index].low, profiles[index].high
+    if profile is not None:
+        ends = profile.low, profile.high
     low, high = parameter.limits
     interval = [None if end is None or not low <= end <= high else parameter.value(end) for end in ends]
     if parameter.start < 0 and parameter.is_log:
@@ -380,11 +398,11 @@ def _estimate(
 
 
 def _curve(
-    parameter: Parameter, index: int, x: Array, uncertainties: Uncertainty, profiles: list[Profile] | None
+    parameter: Parameter, index: int, x: Array, uncertainties: Uncertainty, profile: Profile | None
 ) -> list[ProfilePoint]:
     """Return the profile of a parameter, or its quadratic approximation."""
-    if profiles is not None:
-        return [ProfilePoint(parameter.value(point.x), point.deviations) for point in profiles[index].points]
+    if profile is not None:
+        return [ProfilePoint(parameter.value(point.x), point.deviations) for point in profile.points]
     # The limit bounds the plotted range of unidentified parameters.
     deviation = min(float(uncertainties.deviations[index]), 3.0)
     return [

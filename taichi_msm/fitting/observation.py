@@ -88,6 +88,10 @@ class Observation(ABC):
             raise SceneError([f"{self.name}: sigma: {shown}; {remedy}"])
         return replace(self, sigma=value)
 
+    def without(self, samples: NDArray[np.bool_]) -> Self:
+        """Return the observation without samples, a mask with the shape of the values without components."""
+        return replace(self, values=np.where(samples[..., None], np.nan, self.values))
+
     @abstractmethod
     def build_model(self, scene: Scene, frames: int) -> ObservationModel:
         """Return the map from a run to the values.

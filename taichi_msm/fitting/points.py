@@ -234,9 +234,7 @@ class PointObservation(Observation):
     def pattern(self, scene: Scene, predicted: Array, signal: float, correlation: ErrorCorrelation) -> str | None:
         remedy = self.correlation_remedy or "give --sigma"
         residuals, displacement = predicted - self.values, predicted - self.at_rest(scene)
-        return rejection.by_pattern(
-            residuals, displacement, self.time, self.coordinates, signal, correlation, remedy
-        )
+        return rejection.by_pattern(residuals, displacement, self.time, self.coordinates, signal, correlation, remedy)
 
     def correlated(self, rows: Array, correlation: ErrorCorrelation) -> tuple[Array, float]:
         from scipy.spatial.distance import cdist
