@@ -3,7 +3,7 @@
 A sample consists of all components of a point, or of a force, at one time. From the solution with soft_l1 on, samples
 are left out if the sum of their squared residuals is above the limit of chi-square for `PROBABILITY`, in units of the
 median residual of the rest, or of sigma if that is larger. The rest is fitted by least squares, until the same samples
-are left out: the loss is min(r^2, limit), which gives gross outliers no weight, and 99.9 % of normal errors full weight.
+are left out: the loss is min(r^2, limit). Gross outliers have no weight, 99.9 % of normal errors have full weight.
 """
 
 from __future__ import annotations

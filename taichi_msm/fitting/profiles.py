@@ -116,19 +116,21 @@ class Profiler:
         while distance > 0 and len(points) < 8:
             trial = np.clip(minima[inner[0]] + (distance - inner[0]) * slope, self._low, self._high)
             trial[n] = x[n] + sign * distance
-            cost, minimum = yield from self._conditional_minimum(n, trial, jacobian)
-            if math.isfinite(cost):
-                minima[distance] = minimum
-                slope = (minimum - minima[inner[0]]) / (distance - inner[0])
+            cost, minimum, is_converged = yield from self._conditional_minimum(n, trial, jacobian)
             rise = math.sqrt(max(0.0, 2 * (cost - self._min_cost) / self._uncertainties.factor))
             rise /= self._uncertainties.widening[n]
+            if is_converged or rise < quantile:
+                minima[distance] = minimum
+                slope = (minimum - minima[inner[0]]) / (distance - inner[0])
+            else:
+                rise, jacobian = math.inf, self._uncertainties.weighted.copy()
             points.append(ProfilePoint(float(trial[n]), sign * rise))
             if abs(rise / quantile - 1) < PROFILE_TOLERANCE or (distance == limit and rise < quantile):
                 break
             inner, outer = ((distance, rise), outer) if rise < quantile else (inner, (distance, rise))
             if outer[1] < math.inf:
                 distance = inner[0] + (outer[0] - inner[0]) * (quantile - inner[1]) / (outer[1] - inner[1])
-            elif outer[0] < math.inf:  # The run there has failed.
+            elif outer[0] < math.inf:  # The run there has failed, or the search of its minimum.
                 distance = (inner[0] + outer[0]) / 2
             else:
                 distance = min(distance * min(3.0, quantile / max(rise, 1e-3)), limit)
@@ -136,8 +138,12 @@ class Profiler:
 
     def _conditional_minimum(
         self, n: int, x: Array, jacobian: Array
-    ) -> Generator[Array, Prediction | None, tuple[float, Array]]:
-        """Minimise over the other parameters, and update the Jacobian; return cost and x, infinite if a run fails."""
+    ) -> Generator[Array, Prediction | None, tuple[float, Array, bool]]:
+        """Minimise over the other parameters, and update the Jacobian.
+
+        Returns:
+            The cost, infinite if the run at x fails, its coordinates, and whether the search has converged.
+        """
         from scipy.optimize import lsq_linear
 
         misfit, factor = self._misfit, self._uncertainties.factor
@@ -145,7 +151,7 @@ class Profiler:
         metric = np.linalg.pinv(self._uncertainties.root @ self._uncertainties.root.T)
         place, residuals = self._solution.x, self._uncertainties.residuals
         best: tuple[float, Array, Array] = (math.inf, x, residuals)
-        share = 1.0
+        share, is_converged = 1.0, False
         for _ in range(MAX_STEPS):
             if (predicted := (yield x)) is None:
                 break
@@ -159,17 +165,17 @@ class Profiler:
             is_better = cost < best[0]
             share = 1.0 if is_better else share / 2
             best = (cost, x, residuals) if is_better else best
-            if not len(others):
+            if is_converged := not len(others):
                 break
             # Gauss-Newton step: first derivatives of rho / 2 over the roots of the second ones.
             gradient = best[2] * misfit.robust_factor(best[2]) ** 0.25
             bounds = (self._low - best[1])[others], (self._high - best[1])[others]
             shift = lsq_linear(jacobian[:, others], -gradient, bounds).x
             expected = float(gradient @ gradient - np.sum((gradient + jacobian[:, others] @ shift) ** 2)) / 2
-            if expected < COST_TOLERANCE * factor:
+            if is_converged := expected < COST_TOLERANCE * factor:
                 break
             x = best[1].copy()
             x[others] += share * shift
         if best[0] < self._min_cost - MIN_FALL * factor and not misfit.robust:
             self.lower = best[1]
-        return best[0], best[1]
+        return best[0], best[1], is_converged
