@@ -79,12 +79,12 @@ def fit(
         workers: number of worker processes; by default chosen by the duration of the first run.
         progress: callback for the stage, the number of finished runs and the expected number; an exception from it
             ends the fit without files.
-        **method: options. Of all fits of numbers: `robust` (lower weight of outliers), `profile` (profile-likelihood
-            intervals). Of points: `sigma` (standard deviation of the errors, replaces that of the file), `correlation`
-            (correlation length of the errors of tracks [px]), `drift` (correlation time of the errors of a track [s]),
-            `resolution` (R of a map). Of tables: `columns` (selected columns, such as ["depth=Traverse, mm"]), `sheet`
-            and `block` of a file, `window` (first and last time [s]), `rate` (frames per second), `contact` (depths of
-            contact [m of the table], one for all tables or one each).
+        **method: options. Of all fits of numbers: `robust` (without outliers), `profile` (profile-likelihood
+            intervals of all parameters). Of points: `sigma` (standard deviation of the errors, replaces that of the
+            file), `correlation` (correlation length of the errors of tracks [px]), `drift` (correlation time of the
+            errors of a track [s]), `resolution` (R of a map). Of tables: `columns` (selected columns, such as
+            ["depth=Traverse, mm"]), `sheet` and `block` of a file, `window` (first and last time [s]), `rate` (frames
+            per second), `contact` (depths of contact [m of the table], one for all tables or one each).
 
     Returns:
         The estimates; `identifiable` is False if the data do not determine a parameter.
@@ -322,17 +322,16 @@ def _rejection(
     """Return the reason for rejecting the model, or None."""
     observations, parts = misfit.observations, misfit.split(uncertainties.residuals)
     predictions, reason = solution.predicted.values, None
-    # Residuals have full weight here, even outliers of a robust fit.
-    name = "chi-square of the plain residuals" if misfit.robust else "chi-square"
+    # Residuals have full weight here, even those of a robust fit of machine tests.
     if all(observed.sigma is not None for observed in observations):
         total = float(uncertainties.residuals @ uncertainties.residuals)
-        reason = rejection.by_chi_square(total, uncertainties.freedom, uncertainties.independent, name)
+        reason = rejection.by_chi_square(total, uncertainties.freedom, uncertainties.independent)
     for observed, values, part, signal in zip(observations, predictions, parts, misfit.signals, strict=True):
         if reason is None and observed.sigma is None:
             reason = observed.pattern(scene, values, signal, error_correlation)
         elif reason is None and observed.is_independent:
             squares = float(part @ part)
-            reason = rejection.by_chi_square(squares, len(part), len(part), f"{name} of the {observed.noun}")
+            reason = rejection.by_chi_square(squares, len(part), len(part), f"chi-square of the {observed.noun}")
     return None if reason is None else reason + _larger_part(observations, parts, predictions)
 
 

@@ -57,7 +57,15 @@ class LeftOut:
 
 
 def leave_out(search: Search, solution: Solution) -> tuple[Solution, list[LeftOut]]:
-    """Fit the observations without outliers by least squares; the misfit of the search becomes that of the rest."""
+    """Fit the observations without outliers by least squares.
+
+    Args:
+        search: robust search; its misfit becomes that of the rest.
+        solution: its solution.
+
+    Returns:
+        The solution of the rest, and the outliers of every observation.
+    """
     everything, left_out = search.misfit, None
     for _ in range(MAX_FITS):
         pairs = zip(everything.observations, solution.predicted.values, everything.signals, strict=True)
