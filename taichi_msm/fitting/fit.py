@@ -195,7 +195,7 @@ def _fit(runs: Runs, scene: Scene, method: Method) -> FitResult:
     left_out: list[LeftOut] = []
     if misfit.robust and machine is None:
         solution, left_out = leave_out(search, solution)
-        misfit, observations = search.misfit, search.misfit.observations
+        misfit, observations = search.misfit, tuple(search.misfit.observations)
     # A wrong sign or unit contradicts both the initial and the fitted scene.
     both = initial, solution.predicted
     if messages := [*opposed(observations, scene, *both), *unit_faults(observations, *both)]:

@@ -26,7 +26,7 @@ Model = Callable[[Array], Array]
 def profiler(model: Model, x: Array, observed: Array) -> Profiler:
     """Profiler of a minimum at x, for errors of 1."""
     count, low = len(observed), np.full(len(x), -5.0)
-    forces = ToolForces("", np.arange(count), observed[:, None], 1.0, np.zeros(count, np.intp))
+    forces = ToolForces("", np.arange(float(count)), observed[:, None], 1.0, np.zeros(count, np.intp))
 
     def predict(coordinates: list[Array]) -> list[Prediction]:
         return [Prediction((model(each)[:, None],), 1, np.zeros(1)) for each in coordinates]
