@@ -45,9 +45,6 @@ from taichi_msm.load.check import check_scene
 from taichi_msm.load.scene_file import load_scene
 from taichi_msm.scene.scene import Scene
 
-# Largest number of minima from which profiles start.
-MAX_MINIMA = 4
-
 
 def fit(
     scene: str | Path | Scene | Mapping[str, Any],
@@ -200,18 +197,11 @@ def _fit(runs: Runs, scene: Scene, method: Method) -> FitResult:
     both = initial, solution.predicted
     if messages := [*opposed(observations, scene, *both), *unit_faults(observations, *both)]:
         raise SceneError(messages)
-    profiles: dict[int, Profile] = {}
-    for remaining in reversed(range(MAX_MINIMA)):
-        uncertainties = uncertainty(misfit, solution, search.jacobian(solution), error_correlation)
-        if isinstance(runs, CurveRuns):
-            runs.by_tangent = False  # Profiles are those of curves.
-        profiler = Profiler(runs, misfit, solution, uncertainties)
-        profiles = profiler.profiles(
-            range(len(parameters)) if method.get("profile") else np.flatnonzero(uncertainties.is_correlated).tolist()
-        )
-        if profiler.lower is None or machine or not remaining:
-            break
-        solution = search.refine(profiler.lower)
+    uncertainties = uncertainty(misfit, solution, search.jacobian(solution), error_correlation)
+    if isinstance(runs, CurveRuns):
+        runs.by_tangent = False  # Profiles are those of curves.
+    is_profiled = uncertainties.is_correlated | method.get("profile", False)
+    profiles = Profiler(runs, misfit, solution, uncertainties).profiles(np.flatnonzero(is_profiled).tolist())
     mesh_error, shifts = _mesh_effect(runs, misfit, solution, uncertainties)
     estimates = {
         parameter.key: _estimate(parameter, float(solution.x[n]), n, uncertainties, profiles.get(n), shifts)

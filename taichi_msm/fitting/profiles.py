@@ -24,9 +24,6 @@ PROFILE_TOLERANCE = 0.01
 # Smallest significant change of the cost [f], and largest number of runs of a conditional minimum.
 COST_TOLERANCE, MAX_STEPS = 0.01, 8
 
-# Smallest fall of the cost below that of the solution [f] which is another minimum.
-MIN_FALL = 0.1
-
 Side = Generator[Array, "Prediction | None", "list[ProfilePoint]"]
 
 
@@ -64,24 +61,20 @@ class Profiler:
         misfit: residuals.
         solution: minimum of their cost.
         uncertainties: uncertainty of the solution.
-
-    Attributes:
-        lower: coordinates of a lower minimum found by a profile, or None.
     """
 
     def __init__(self, runs: Runs, misfit: Misfit, solution: Solution, uncertainties: Uncertainty) -> None:
         self._runs, self._misfit, self._solution, self._uncertainties = runs, misfit, solution, uncertainties
         self._min_cost = misfit.cost(uncertainties.residuals)
         self._low, self._high = runs.problem.limits
-        self.lower: Array | None = None
 
     def profiles(self, parameters: Iterable[int]) -> dict[int, Profile]:
-        """Return the profiles of parameters by index, with both sides of each in parallel, up to a lower minimum."""
+        """Return the profiles of parameters by index, with both sides of each computed in parallel."""
         runs = self._runs
         sides = {(n, sign): self._side(n, sign) for n in parameters for sign in (-1, 1)}
         points: dict[tuple[int, int], list[ProfilePoint]] = {side_key: [] for side_key in sides}
         requests = {side_key: x for side_key, side in sides.items() if (x := next(side, None)) is not None}
-        while requests and self.lower is None:
+        while requests:
             runs.expected = max(runs.expected, runs.count + 2 * len(requests))
             predictions = runs.predict_many(list(requests.values()))
             for side_key, prediction in zip(list(requests), predictions, strict=True):
@@ -176,6 +169,4 @@ class Profiler:
                 break
             x = best[1].copy()
             x[others] += share * shift
-        if best[0] < self._min_cost - MIN_FALL * factor and not misfit.robust:
-            self.lower = best[1]
         return best[0], best[1], is_converged

@@ -1,4 +1,4 @@
-"""Profile likelihood of analytical models: conditional minima, and another minimum."""
+"""Profile likelihood of analytical models: conditional minima."""
 
 from __future__ import annotations
 
@@ -53,17 +53,3 @@ def test_conditional_minima_of_a_curved_model() -> None:
         rise = minimize_scalar(lambda b, end=end: np.sum((model(np.array([end, b])) - observed) ** 2), (-1, 1)).fun
         # An end is determined to 1 % of its distance, and a conditional minimum to 0.01 of a cost of 2.
         assert rise == pytest.approx(quantile**2, rel=0.03)
-
-
-def test_a_lower_minimum_beyond_a_barrier() -> None:
-    """Squares of 1.5 (x^2 - 1) and 0.6 (x - 1) have minima near -0.9 and at 1, and a barrier of 2.6 near 0."""
-
-    def model(x: Array) -> Array:
-        return np.concatenate([1.5 * (x**2 - 1), 0.6 * (x - 1), np.zeros(38)])
-
-    minimum = minimize_scalar(lambda x: np.sum(model(np.array([x])) ** 2), (-1.1, -0.7)).x
-    profiled = profiler(model, np.array([minimum]), np.zeros(40))
-    profiled.profiles([0])
-    assert profiled.lower is not None
-    assert profiled.lower[0] > 0.5
-    assert profiler(model, np.ones(1), np.zeros(40)).lower is None
