@@ -1,4 +1,4 @@
-"""Readers of the cells of text tables and workbooks, and parser of their numbers.
+"""Cells of tables, reader of text tables, and parser of numbers.
 
 Texts are UTF-8, UTF-16 or Windows-1252; their separator is detected from the header.
 """
@@ -7,25 +7,20 @@ from __future__ import annotations
 
 import codecs
 import csv
-import datetime
-import io
 import re
-import warnings
-import zipfile
 from collections.abc import Callable, Iterable, Sequence
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
 
-from taichi_msm.errors import NotInstalledError, SceneError
+from taichi_msm.errors import SceneError
 from taichi_msm.images import irregular_kind
 from taichi_msm.scene.section import MAX_MAGNITUDE
 
 Row = list[str]
 
-# Largest size of a file and of an unpacked workbook [bytes], and largest number of cells of a sheet.
-MAX_BYTES, MAX_UNPACKED_BYTES, MAX_CELLS = 2**26, 2**29, 10**7
+# Largest size of a file [bytes].
+MAX_BYTES = 2**26
 
 WORKBOOK_SUFFIX = ".xlsx"
 
@@ -56,7 +51,7 @@ class Grid:
         rows: cells of every row, without empty ones at the end.
         separator: key of `SEPARATORS`, empty for a workbook.
         counts: number of cells of every row of a text, including empty ones at the end.
-        merged: (row, column) of every cell that is merged with its right neighbour.
+        merged: (first row, last row, column) of cells that are merged with their right neighbours.
     """
 
     name: str
@@ -64,7 +59,7 @@ class Grid:
     rows: list[Row]
     separator: str = ""
     counts: Sequence[int] = ()
-    merged: frozenset[tuple[int, int]] = frozenset()
+    merged: list[tuple[int, int, int]] = field(default_factory=list)
 
     @property
     def title(self) -> str:
@@ -80,9 +75,14 @@ class Grid:
         """
         if not self.sheet:
             return f"{self.name}:{row + 1}"
-        from openpyxl.utils import get_column_letter
+        letters = ""
+        while column >= 0:
+            letters, column = chr(ord("A") + column % 26) + letters, column // 26 - 1
+        return f"{self.name}: {self.sheet}!{letters}{row + 1}"
 
-        return f"{self.name}: {self.sheet}!{get_column_letter(column + 1)}{row + 1}"
+    def merged_columns(self, row: int) -> list[int]:
+        """Return the columns of a row that are merged with their right neighbours."""
+        return [column for first, last, column in self.merged if first <= row <= last]
 
     def has_content(self, row: int) -> bool:
         """Return whether a row has letters or digits, and is not a comment of a text."""
@@ -147,7 +147,7 @@ def read_text(name: str, is_header: Callable[[Row], bool], expected: str) -> Gri
         SceneError: when the file cannot be read, or is not a text.
     """
     rows, counts, separator = [], [], ""
-    lines = re.split(r"\r\n|\r|\n", _decode(name, _read_bytes(name, expected), expected))
+    lines = re.split(r"\r\n|\r|\n", _decode(name, read_bytes(name, expected), expected))
     for n, line in enumerate(lines):
         headers = {}
         if LETTER.search(line):
@@ -158,41 +158,6 @@ def read_text(name: str, is_header: Callable[[Row], bool], expected: str) -> Gri
         rows.append(_strip(cells))
         counts.append(len(cells))
     return Grid(name, "", rows, separator, counts)
-
-
-def read_workbook(name: str, expected: str) -> dict[str, Grid]:
-    """Return the worksheets of a workbook by name.
-
-    Args:
-        name: path of the file.
-        expected: description of a readable file, for messages.
-
-    Raises:
-        SceneError: when the file cannot be read, or is not a workbook.
-        NotInstalledError: when openpyxl is not installed.
-    """
-    try:
-        import openpyxl
-    except ImportError:
-        raise NotInstalledError(f"{name}: needs openpyxl, which is not installed; pip install openpyxl") from None
-    data = _read_bytes(name, expected)
-    try:
-        with zipfile.ZipFile(io.BytesIO(data)) as archive:
-            unpacked = sum(entry.file_size for entry in archive.infolist())
-        if unpacked > MAX_UNPACKED_BYTES:
-            raise SceneError([f"{name}: {unpacked / 1e6:.0f} MB unpacked; save the sheet as CSV"])
-        # openpyxl warns about ignored parts, such as styles.
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")
-            # Saved values, and formulas where no value was saved.
-            values, formulas = (openpyxl.load_workbook(io.BytesIO(data), data_only=saved) for saved in (True, False))
-        return {sheet.title: _read_sheet(name, sheet, formulas[sheet.title]) for sheet in values.worksheets}
-    except SceneError:
-        raise
-    # openpyxl raises errors of any kind for a damaged file.
-    except Exception as error:
-        reason = f"not a workbook, or a damaged one ({type(error).__name__})"
-        raise SceneError([f"{name}: {reason}; save it again as .xlsx, or as CSV"]) from None
 
 
 def parse_number(cell: str) -> tuple[float, int] | None:
@@ -213,32 +178,6 @@ def parse_number(cell: str) -> tuple[float, int] | None:
 def decimal_mark(cell: str) -> str:
     """Return the last . or , in a cell, or an empty string."""
     return "," if cell.rfind(",") > cell.rfind(".") else "." if "." in cell else ""
-
-
-def _read_sheet(name: str, sheet: Any, formulas: Any) -> Grid:
-    """Read the cells of a worksheet as strings."""
-    if (cells := sheet.max_row * sheet.max_column) > MAX_CELLS:
-        raise SceneError([f"{name}: {sheet.title}: {cells} cells; delete the empty rows and columns around the table"])
-    rows = [
-        _strip([_format_cell(value if value is not None else formula) for value, formula in zip(*pair, strict=False)])
-        for pair in zip(sheet.iter_rows(values_only=True), formulas.iter_rows(values_only=True), strict=False)
-    ]
-    merged = frozenset(
-        (row - 1, block.min_col - 1)
-        for block in sheet.merged_cells.ranges
-        for row in range(block.min_row, min(block.max_row, len(rows)) + 1)
-        if block.max_col > block.min_col
-    )
-    return Grid(name, sheet.title, rows, merged=merged)
-
-
-def _format_cell(value: object) -> str:
-    """Format the value of a cell, numbers with the 15 digits of Excel."""
-    if isinstance(value, float):
-        return format(value, ".15g")
-    if isinstance(value, datetime.date | datetime.time | datetime.timedelta):
-        return f"a date or time of day, {value}"
-    return "" if value is None else str(value)
 
 
 def _strip(cells: Row) -> Row:
@@ -277,7 +216,7 @@ def _split_line(line: str, separator: str) -> Row:
     return [line]
 
 
-def _read_bytes(name: str, expected: str) -> bytes:
+def read_bytes(name: str, expected: str) -> bytes:
     """Read a file of at most `MAX_BYTES`."""
     try:
         if not (reason := irregular_kind(Path(name))):

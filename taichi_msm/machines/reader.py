@@ -17,7 +17,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from taichi_msm.errors import SceneError, did_you_mean
-from taichi_msm.machines.cells import LETTER, WORKBOOK_SUFFIX, Grid, Row, parse_number, read_text, read_workbook
+from taichi_msm.machines.cells import LETTER, WORKBOOK_SUFFIX, Grid, Row, parse_number, read_text
+from taichi_msm.machines.workbook import read_workbook
 
 Array = NDArray[np.float64]
 
@@ -109,7 +110,6 @@ def read_machine_test(
 
     Raises:
         SceneError: when the file has no such table, or several without a selection.
-        NotInstalledError: when the file is a workbook and openpyxl is not installed.
     """
     name, chosen = str(path), _parse_choices(columns)
     if name.lower().endswith(WORKBOOK_SUFFIX):
@@ -339,7 +339,7 @@ def _select_columns(grid: Grid, block: _Block, chosen: dict[str, str]) -> tuple[
         if (repeated := sum(column.title == best.title for column in columns)) > 1:
             fault = f"{repeated} columns of this name; rename or delete all but one"
             raise SceneError([f"{grid.place(header, best.index)}: {best.title}: {fault}"])
-        if (header, best.index) in grid.merged:
+        if best.index in grid.merged_columns(header):
             raise SceneError([_describe_merged(grid, header, best.index)])
         if others := [column.title for column in columns if column != best]:
             than = " and ".join(map(repr, others))
@@ -356,7 +356,7 @@ def _missing_header(grid: Grid, chosen: dict[str, str]) -> str:
     cells = [row if grid.sheet else re.split(r"[\t;,|]", ";".join(row)) for row in grid.rows]
     named = [{quantity for quantity, columns in _find_candidates(row, chosen).items() if columns} for row in cells]
     best = max(range(len(named)), key=lambda row: len(named[row]))
-    if merged := [column for row, column in grid.merged if row == best and named[best]]:
+    if named[best] and (merged := grid.merged_columns(best)):
         return _describe_merged(grid, best, min(merged))
     shown = f"{grid.place(best)}: {', '.join(grid.rows[best])[:100]!r}"
     missing = [quantity for quantity in WORDS if quantity not in named[best]]
