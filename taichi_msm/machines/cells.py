@@ -19,8 +19,8 @@ from taichi_msm.scene.section import MAX_MAGNITUDE
 
 Row = list[str]
 
-# Largest size of a file [bytes].
-MAX_BYTES = 2**26
+# Largest size of a file [bytes], and number of lines of a text.
+MAX_BYTES, MAX_LINES = 2**26, 2**23
 
 WORKBOOK_SUFFIX = ".xlsx"
 
@@ -29,6 +29,8 @@ SEPARATORS = {"tabs": "\t", "semicolons": ";", "commas": ",", "bars": "|", "wide
 
 # Patterns of the spaces between titles; a single space before a unit in brackets does not separate.
 SPACES = {"wide spaces": re.compile(r"\s{2,}"), "spaces": re.compile(r"\s+(?![\[(])")}
+
+LINE_END = re.compile(r"\r\n|\r|\n")
 
 # Letter other than e, which numbers contain.
 LETTER = re.compile(r"[^\W\d_eE]")
@@ -121,15 +123,14 @@ class Grid:
         numbers, known_mark = [], ""
         for row, column in cells:
             cell = self.rows[row][column]
-            where = f"{self.place(row, column)}: {self.rows[header][column]}: {cell[:40]!r}"
-            if (number := parse_number(cell)) is None:
-                if cell.startswith("="):
-                    remedy = "calculate and save the workbook"
-                    where += ", a formula without a saved value"
+            number, mark = parse_number(cell), decimal_mark(cell)
+            if number is None or (mark and known_mark not in ("", mark)):
+                where = f"{self.place(row, column)}: {self.rows[header][column]}: {cell[:40]!r}"
+                if number is not None:
+                    where, remedy = f"{where}; the table has both . and , as decimal marks", "take one"
+                elif cell.startswith("="):
+                    where, remedy = f"{where}, a formula without a saved value", "calculate and save the workbook"
                 raise SceneError([f"{where}; {remedy}"])
-            mark = decimal_mark(cell)
-            if mark and known_mark not in ("", mark):
-                raise SceneError([f"{where}; the table has both . and , as decimal marks; take one"])
             known_mark = mark or known_mark
             numbers.append(number)
         return numbers
@@ -146,14 +147,24 @@ def read_text(name: str, is_header: Callable[[Row], bool], expected: str) -> Gri
     Raises:
         SceneError: when the file cannot be read, or is not a text.
     """
-    rows, counts, separator = [], [], ""
-    lines = re.split(r"\r\n|\r|\n", _decode(name, read_bytes(name, expected), expected))
+    rows, counts, separator, numbers_row, numbers = [], [], "", -1, dict[str, list[bool]]()
+    data = read_bytes(name, expected)
+    if (count := max(data.count(b"\n"), data.count(b"\r"))) > MAX_LINES:
+        raise SceneError([f"{name}: {count:,} lines, above {MAX_LINES:,}; delete lines without cells"])
+    lines = LINE_END.split(_decode(name, data, expected))
     for n, line in enumerate(lines):
         headers = {}
         if LETTER.search(line):
-            headers = {key: row for key in SEPARATORS if is_header(row := _split_header(line, key))}
+            splits = {key: _split_header(line, key) for key, mark in SEPARATORS.items() if mark in line}
+            headers = {key: row for key, row in splits.items() if is_header(row)}
         if headers:
-            separator = _choose_separator(headers, lines[n + 1 :])
+            if numbers_row < n:
+                of_numbers = (k for k in range(n + 1, len(lines)) if lines[k].strip() and not LETTER.search(lines[k]))
+                numbers_row = next(of_numbers, len(lines))
+                numbers = {key: _are_numbers("".join(lines[numbers_row : numbers_row + 1]), key) for key in SEPARATORS}
+            # The first separator that splits the next line of numbers into at least three, or else the first one.
+            suitable = (key for key, row in headers.items() if sum(numbers[key][: len(row)]) >= 3)
+            separator = next(suitable, next(iter(headers)))
         cells = headers[separator] if headers else _split_line(line, separator)
         rows.append(_strip(cells))
         counts.append(len(cells))
@@ -188,15 +199,9 @@ def _strip(cells: Row) -> Row:
     return cells
 
 
-def _choose_separator(headers: dict[str, Row], lines: list[str]) -> str:
-    """Return the first separator that splits the next line of numbers into at least three; otherwise the first key."""
-    line = next((line for line in lines if line.strip() and not LETTER.search(line)), "")
-
-    def count(separator: str) -> int:
-        cells = _strip(_split_line(line, separator))[: len(headers[separator])]
-        return sum(parse_number(cell) is not None for cell in cells)
-
-    return next((separator for separator in headers if count(separator) >= 3), next(iter(headers)))
+def _are_numbers(line: str, separator: str) -> list[bool]:
+    """Return whether each cell of a line is a number."""
+    return [parse_number(cell) is not None for cell in _strip(_split_line(line, separator))]
 
 
 def _split_header(line: str, separator: str) -> Row:
@@ -231,18 +236,21 @@ def read_bytes(name: str, expected: str) -> bytes:
 
 
 def _decode(name: str, data: bytes, expected: str) -> str:
-    """Decode a text; without a byte order mark, zero bytes mean UTF-16, and their parity its byte order."""
+    """Decode a text; without a byte order mark, zero bytes are the halves of the ASCII characters of UTF-16."""
     if data.startswith((b"PK", b"\xd0\xcf\x11\xe0")):
         raise SceneError([f"{name}: a workbook; {expected}"])
     if data.startswith((b"\xff\xfe", b"\xfe\xff")):
         encodings = ["utf-16"]
-    elif b"\0" in data:
-        encodings = ["utf-16-le" if data[1::2].count(0) > data[::2].count(0) else "utf-16-be"]
+    elif 4 * abs(zeros := data[1::2].count(0) - data[::2].count(0)) > len(data):
+        encodings = ["utf-16-le" if zeros > 0 else "utf-16-be"]
     else:
         # Windows programs of western Europe write cp1252; the numbers are ASCII in any encoding.
         data, encodings = data.removeprefix(codecs.BOM_UTF8), ["utf-8", "cp1252"]
     for encoding in encodings:
         with suppress(UnicodeDecodeError):
-            if "\0" not in (text := data.decode(encoding, "replace" if encoding == "cp1252" else "strict")):
+            text = data.decode(encoding, "replace" if encoding == "cp1252" else "strict")
+            if (zero := text.find("\0")) < 0:
                 return text
+            line = len(LINE_END.split(text[:zero]))
+            raise SceneError([f"{name}:{line}: a zero byte; remove it, or save the table as CSV in UTF-8"])
     raise SceneError([f"{name}: not a text; save it as CSV in UTF-8"])
