@@ -191,7 +191,7 @@ def _split_titles(row: Row) -> list[tuple[str, str]]:
 
 
 def _is_header(row: Row) -> bool:
-    return {*COLUMNS} <= {name for name, _ in _split_titles(row)}
+    return len(row) >= len(COLUMNS) and {*COLUMNS} <= {name for name, _ in _split_titles(row)}
 
 
 def _require_units(where: str, units: Sequence[str]) -> None:

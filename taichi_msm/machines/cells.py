@@ -159,13 +159,11 @@ def read_text(name: str, is_header: Callable[[Row], bool], expected: str) -> Gri
             headers = {key: row for key, row in splits.items() if is_header(row)}
         if headers:
             if numbers_row < n:
-                of_numbers = (k for k in range(n + 1, len(lines)) if lines[k].strip() and not LETTER.search(lines[k]))
-                numbers_row = next(of_numbers, len(lines))
-                numbers = {key: _are_numbers("".join(lines[numbers_row : numbers_row + 1]), key) for key in SEPARATORS}
+                numbers_row, numbers = _find_numbers(lines, n + 1)
             # The first separator that splits the next line of numbers into at least three, or else the first one.
             suitable = (key for key, row in headers.items() if sum(numbers[key][: len(row)]) >= 3)
             separator = next(suitable, next(iter(headers)))
-        cells = headers[separator] if headers else _split_line(line, separator)
+        cells = headers[separator] if headers else _split_line(line, separator) if line else []
         rows.append(_strip(cells))
         counts.append(len(cells))
     return Grid(name, "", rows, separator, counts)
@@ -199,9 +197,12 @@ def _strip(cells: Row) -> Row:
     return cells
 
 
-def _are_numbers(line: str, separator: str) -> list[bool]:
-    """Return whether each cell of a line is a number."""
-    return [parse_number(cell) is not None for cell in _strip(_split_line(line, separator))]
+def _find_numbers(lines: list[str], start: int) -> tuple[int, dict[str, list[bool]]]:
+    """Return the index of the next line of numbers, and whether its cells are numbers, by separator."""
+    found = (n for n in range(start, len(lines)) if lines[n].strip() and not LETTER.search(lines[n]))
+    index = next(found, len(lines))
+    line = lines[index] if index < len(lines) else ""
+    return index, {key: [parse_number(cell) is not None for cell in _split_line(line, key)] for key in SEPARATORS}
 
 
 def _split_header(line: str, separator: str) -> Row:

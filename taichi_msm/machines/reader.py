@@ -241,7 +241,7 @@ def _find_blocks(grid: Grid, chosen: dict[str, str], min_rows: int = MIN_ROWS) -
 
 def _is_header(row: Row, chosen: dict[str, str]) -> bool:
     """Return whether a row has a title of every quantity, each in its own cell."""
-    if sum(bool(LETTER.search(cell)) for cell in row) < len(WORDS):
+    if len(row) < len(WORDS) or sum(bool(LETTER.search(cell)) for cell in row) < len(WORDS):
         return False
     candidates = _find_candidates(row, chosen).values()
     return any(len({*columns}) == len(columns) for columns in product(*candidates))

@@ -40,9 +40,9 @@ def texts(title: str, rows: str) -> Iterator[Case]:
             yield f"{where} of {character!r}", content, []
         yield f"column {character!r}", f"{title}\n{rows}", [f"depth={line}"]
     yield "titles", title + ";(a" * 30_000 + f"\n{rows}", []
-    yield "candidates", title + "".join(f";Force {n} [N]" for n in range(30_000)) + f"\n{rows}", []
-    yield "headers", f"{title}\n" * 20_000, []
-    yield "headers before a long row", f"{title}\n" * 20_000 + "0;" * (SIZE // 2), []
+    yield "candidates", title + "".join(f";Force {n} [N]" for n in range(10_000)) + f"\n{rows}", []
+    yield "headers", f"{title}\n" * 10_000, []
+    yield "headers before a long row", f"{title}\n" * 10_000 + "0;" * (SIZE // 2), []
     yield "columns and rows", title + ";a" * 30_000 + "\n" * 100_000 + rows, []
 
 
@@ -54,7 +54,9 @@ def machine_tables() -> Iterator[Case]:
 
 
 def forces_tables() -> Iterator[Case]:
-    return texts("time;probe;force_x;force_y;force_z", "0;0;1;2;3\n")
+    # The cells are read as those of machine tables.
+    cases = texts("time;probe;force_x;force_y;force_z", "0;0;1;2;3\n")
+    return (case for case in cases if not case[0].startswith(("line", "column '")))
 
 
 BOOK = "<sheets><sheet name='a' r:id='works'/></sheets>"
