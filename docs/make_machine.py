@@ -21,8 +21,8 @@ import matplotlib.pyplot as plt
 import numpy as np
 
 from taichi_msm import FitResult, SceneError, Simulation, fit, load_scene
-from taichi_msm.machines.cells import read_workbook
 from taichi_msm.machines.reader import EXPECTED, read_machine_test
+from taichi_msm.machines.workbook import read_workbook
 from taichi_msm.plot_style import BLUE, DPI, STYLE, VERMILION
 from taichi_msm.study.format import markdown_table
 

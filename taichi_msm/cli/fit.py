@@ -24,12 +24,12 @@ from taichi_msm.errors import DivergedError, printable
     help="Measured forces of the tools, as in forces.csv, and their standard deviation [N].",
 )
 @click.option("--sigma", type=float, metavar="SIGMA", help="Standard deviation of the observations [m] or [px].")
-@click.option("--robust", is_flag=True, help="Reduce the weight of outliers.")
+@click.option("--robust", is_flag=True, help="Leave out outliers; of tables, reduce their weight.")
 @click.option(
     "--correlation", type=float, metavar="PX", help="Correlation length of the errors of tracks in a picture [px]."
 )
 @click.option("--drift", type=float, metavar="SECONDS", help="Correlation time of the errors of a track [s].")
-@click.option("--profile", is_flag=True, help="Compute intervals by profile likelihood; takes more runs.")
+@click.option("--profile", is_flag=True, help="Compute all intervals by profile likelihood; takes more runs.")
 @click.option("--resolution", type=int, metavar="R", help="Cells along a side of a fitted map.")
 @click.option("--columns", metavar="NAME=COLUMN", multiple=True, help='Of tables: a column, as "depth=Traverse, mm".')
 @click.option("--sheet", metavar="SHEET", help="Of tables: sheet of a workbook.")

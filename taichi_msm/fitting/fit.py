@@ -25,6 +25,7 @@ from taichi_msm.fitting.machine_curve import CurveRuns, has_curve, search_by_cur
 from taichi_msm.fitting.machine_fit import FittedTest, contact_notes, explanations, fitted_tests, unknown_notes
 from taichi_msm.fitting.machine_model import TABLE_OPTIONS, MachineProblem, read_machine_problem, table_paths
 from taichi_msm.fitting.observation import Array, ErrorCorrelation, Observation
+from taichi_msm.fitting.outliers import LeftOut, leave_out
 from taichi_msm.fitting.parameters import Bounds, Method, Parameter, as_data, make_parameters, require_types, rounded
 from taichi_msm.fitting.points import PointObservation
 from taichi_msm.fitting.predict import FitProblem, Prediction, Runs, without_outputs
@@ -33,6 +34,7 @@ from taichi_msm.fitting.report import publication, write_report
 from taichi_msm.fitting.result import Estimate, FitResult, FittedMap
 from taichi_msm.fitting.stiffness_map import KEY, MapSettings, fit_map, map_settings
 from taichi_msm.fitting.uncertainty import (
+    MAX_CORRELATION,
     MAX_RELATIVE_ERROR,
     Uncertainty,
     UnidentifiedGroup,
@@ -74,12 +76,12 @@ def fit(
         workers: number of worker processes; by default chosen by the duration of the first run.
         progress: callback for the stage, the number of finished runs and the expected number; an exception from it
             ends the fit without files.
-        **method: options. Of all fits of numbers: `robust` (lower weight of outliers), `profile` (profile-likelihood
-            intervals). Of points: `sigma` (standard deviation of the errors, replaces that of the file), `correlation`
-            (correlation length of the errors of tracks [px]), `drift` (correlation time of the errors of a track [s]),
-            `resolution` (R of a map). Of tables: `columns` (selected columns, such as ["depth=Traverse, mm"]), `sheet`
-            and `block` of a file, `window` (first and last time [s]), `rate` (frames per second), `contact` (depths of
-            contact [m of the table], one for all tables or one each).
+        **method: options. Of all fits of numbers: `robust` (without outliers), `profile` (profile-likelihood
+            intervals of all parameters). Of points: `sigma` (standard deviation of the errors, replaces that of the
+            file), `correlation` (correlation length of the errors of tracks [px]), `drift` (correlation time of the
+            errors of a track [s]), `resolution` (R of a map). Of tables: `columns` (selected columns, such as
+            ["depth=Traverse, mm"]), `sheet` and `block` of a file, `window` (first and last time [s]), `rate` (frames
+            per second), `contact` (depths of contact [m of the table], one for all tables or one each).
 
     Returns:
         The estimates; `identifiable` is False if the data do not determine a parameter.
@@ -113,6 +115,8 @@ def fit(
         problem, settings = _read_problem(observed, initial, free, bounds or {}, forces, method)
     with ExitStack() as stack:
         if directory is not None:
+            # From here on an interruption is an exception, which removes the unfinished files.
+            progress("fit", 0, 1)
             stack.enter_context(writing(directory))
             publisher = stack.enter_context(publication(Path(directory)))
         if settings is not None:
@@ -187,6 +191,10 @@ def _fit(runs: Runs, scene: Scene, method: Method) -> FitResult:
         if machine:
             search.remember(start, initial)
         solution = search.best(start)
+    left_out: list[LeftOut] = []
+    if misfit.robust and machine is None:
+        solution, left_out = leave_out(search, solution)
+        misfit, observations = search.misfit, tuple(search.misfit.observations)
     # A wrong sign or unit contradicts both the initial and the fitted scene.
     both = initial, solution.predicted
     if messages := [*opposed(observations, scene, *both), *unit_faults(observations, *both)]:
@@ -195,16 +203,17 @@ def _fit(runs: Runs, scene: Scene, method: Method) -> FitResult:
     uncertainties = uncertainty(misfit, solution, derivatives, error_correlation)
     if isinstance(runs, CurveRuns):
         runs.by_tangent = False  # Profiles are those of curves.
-    profiles = Profiler(runs, misfit, solution, uncertainties).profiles() if method.get("profile") else None
+    is_profiled = uncertainties.is_correlated | method.get("profile", False)
+    profiles = Profiler(runs, misfit, solution, uncertainties).profiles(np.flatnonzero(is_profiled).tolist())
     mesh_error, shifts = _mesh_effect(runs, misfit, solution, uncertainties)
     estimates = {
-        parameter.key: _estimate(parameter, float(solution.x[n]), n, uncertainties, profiles, shifts)
+        parameter.key: _estimate(parameter, float(solution.x[n]), n, uncertainties, profiles.get(n), shifts)
         for n, parameter in enumerate(parameters)
     }
     values = {key: estimate.value for key, estimate in estimates.items()}
     measures_forces = any(observed.noun == "forces" for observed in observations)
     unidentified = unidentified_groups(parameters, solution.x, uncertainties, forces=measures_forces)
-    rejection_reason = _rejection(misfit, solution, uncertainties, error_correlation)
+    rejection_reason = _rejection(scene, misfit, solution, uncertainties, error_correlation)
     tests: tuple[FittedTest, ...] = ()
     if machine:
         tests = fitted_tests(machine, values, solution.predicted.values[0], derivatives, uncertainties)
@@ -245,10 +254,11 @@ def _fit(runs: Runs, scene: Scene, method: Method) -> FitResult:
             Scene(**machine.fitted_data(as_data(scene), values, n)) for n in range(1, len(tests)) if machine is not None
         ],
         observations=observations,
+        left_out=left_out,
         fitted=solution.predicted.values,
         tests=tests,
         curves={
-            parameter.key: _curve(parameter, n, solution.x, uncertainties, profiles)
+            parameter.key: _curve(parameter, n, solution.x, uncertainties, profiles.get(n))
             for n, parameter in enumerate(parameters)
         },
     )
@@ -298,30 +308,29 @@ def uncertainty_notes(
         shares = [(parameters[n].key, parameters[n].relative_error(x[n], float(shifts[n]))) for n in moved]
         shifted_parameters = ", ".join(f"{key} by about {rounded(100 * share)} %" for key, share in shares)
         yield f"the mesh changes {shifted_parameters}, more than the interval; take more sheet.points"
-    for n, m in zip(*np.nonzero(np.triu(np.abs(uncertainties.correlation) > 0.95, 1)), strict=True):
+    for n, m in zip(*np.nonzero(np.triu(np.abs(uncertainties.correlation) > MAX_CORRELATION, 1)), strict=True):
         keys = parameters[n].key, parameters[m].key
         if not any({*keys} <= {*group.parameters} for group in unidentified):
             fault = f"{keys[0]} and {keys[1]} correlate by {uncertainties.correlation[n, m]:.3f}"
-            yield f"{fault}: their combination is more certain than each alone"
+            yield f"{fault}: the data hardly distinguish them, so that small model errors shift both; fix one if known"
 
 
 def _rejection(
-    misfit: Misfit, solution: Solution, uncertainties: Uncertainty, error_correlation: ErrorCorrelation
+    scene: Scene, misfit: Misfit, solution: Solution, uncertainties: Uncertainty, error_correlation: ErrorCorrelation
 ) -> str | None:
     """Return the reason for rejecting the model, or None."""
     observations, parts = misfit.observations, misfit.split(uncertainties.residuals)
     predictions, reason = solution.predicted.values, None
-    # Residuals have full weight here, even outliers of a robust fit.
-    name = "chi-square of the plain residuals" if misfit.robust else "chi-square"
+    # Residuals have full weight here, even those of a robust fit of machine tests.
     if all(observed.sigma is not None for observed in observations):
         total = float(uncertainties.residuals @ uncertainties.residuals)
-        reason = rejection.by_chi_square(total, uncertainties.freedom, uncertainties.independent, name)
+        reason = rejection.by_chi_square(total, uncertainties.freedom, uncertainties.independent)
     for observed, values, part, signal in zip(observations, predictions, parts, misfit.signals, strict=True):
         if reason is None and observed.sigma is None:
-            reason = observed.pattern(values - observed.values, signal, error_correlation)
+            reason = observed.pattern(scene, values, signal, error_correlation)
         elif reason is None and observed.is_independent:
             squares = float(part @ part)
-            reason = rejection.by_chi_square(squares, len(part), len(part), f"{name} of the {observed.noun}")
+            reason = rejection.by_chi_square(squares, len(part), len(part), f"chi-square of the {observed.noun}")
     return None if reason is None else reason + _larger_part(observations, parts, predictions)
 
 
@@ -364,14 +373,14 @@ def _estimate(
     x: float,
     index: int,
     uncertainties: Uncertainty,
-    profiles: list[Profile] | None,
+    profile: Profile | None,
     shifts: Array | None,
 ) -> Estimate:
     deviation = float(uncertainties.deviations[index])
     half_width = uncertainties.quantile * deviation
     ends: tuple[float | None, float | None] = (x - half_width, x + half_width)
-    if profiles is not None:
-        ends = profiles[index].low, profiles[index].high
+    if profile is not None:
+        ends = profile.low, profile.high
     low, high = parameter.limits
     interval = [None if end is None or not low <= end <= high else parameter.value(end) for end in ends]
     if parameter.start < 0 and parameter.is_log:
@@ -387,11 +396,11 @@ def _estimate(
 
 
 def _curve(
-    parameter: Parameter, index: int, x: Array, uncertainties: Uncertainty, profiles: list[Profile] | None
+    parameter: Parameter, index: int, x: Array, uncertainties: Uncertainty, profile: Profile | None
 ) -> list[ProfilePoint]:
     """Return the profile of a parameter, or its quadratic approximation."""
-    if profiles is not None:
-        return [ProfilePoint(parameter.value(point.x), point.deviations) for point in profiles[index].points]
+    if profile is not None:
+        return [ProfilePoint(parameter.value(point.x), point.deviations) for point in profile.points]
     # The limit bounds the plotted range of unidentified parameters.
     deviation = min(float(uncertainties.deviations[index]), 3.0)
     return [

@@ -164,11 +164,10 @@ def read_forces(path: str | Path, sigma: float, probes: int) -> ToolForces:
             fault = "a comma within a cell, and commas between cells"
             remedy = "write thousands without commas, or separate cells by semicolons"
             raise SceneError([f"{grid.place(n)}: {grid.rows[header][column]}: {text[:40]!r}, {fault}; {remedy}"])
-    table = np.full((len(grid.rows), len(names)), np.nan)
+    table, row_index = np.full((len(rows), len(columns)), np.nan), {n: index for index, n in enumerate(rows)}
     remedy = "take a number, or leave the cell empty if not measured"
-    for cell, (value, _) in zip(cells, grid.numbers(header, cells, remedy), strict=True):
-        table[cell] = value
-    table = table[np.ix_(rows, columns)]
+    for (n, column), (value, _) in zip(cells, grid.numbers(header, cells, remedy), strict=True):
+        table[row_index[n], columns.index(column)] = value
     time, probe, force = table[:, 0], table[:, 1], table[:, 2:]
     for key, values in (("time", time), ("probe", probe)):
         if len(absent := np.flatnonzero(np.isnan(values))):
@@ -192,11 +191,11 @@ def _split_titles(row: Row) -> list[tuple[str, str]]:
 
 
 def _is_header(row: Row) -> bool:
-    return {*COLUMNS} <= {name for name, _ in _split_titles(row)}
+    return len(row) >= len(COLUMNS) and {*COLUMNS} <= {name for name, _ in _split_titles(row)}
 
 
 def _require_units(where: str, units: Sequence[str]) -> None:
     """Raise a SceneError unless every unit is missing, or seconds or newtons as in `COLUMNS`."""
     for (key, expected), unit in zip(COLUMNS.items(), units, strict=True):
         if unit not in (expected, "", "-", "1"):
-            raise SceneError([f"{where}: {key}: unit {unit!r}; give seconds and newtons"])
+            raise SceneError([f"{where}: {key}: unit {unit[:40]!r}; give seconds and newtons"])

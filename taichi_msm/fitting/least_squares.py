@@ -143,7 +143,7 @@ class Search:
     """
 
     def __init__(self, runs: Runs, misfit: Misfit, limits: tuple[Array, Array] | None = None) -> None:
-        self._runs, self._misfit = runs, misfit
+        self._runs, self.misfit = runs, misfit
         self._delta = difference_step(runs.problem.scene)
         self._limits = limits or runs.problem.limits
         self._known: dict[bytes, Prediction | None] = {}
@@ -169,7 +169,7 @@ class Search:
 
     def fits_well(self, solution: Solution) -> bool:
         """Return whether the residuals of all observations are small."""
-        misfit = self._misfit
+        misfit = self.misfit
         residuals = misfit.split(misfit.difference(solution.predicted))
         deviations = misfit.deviations(solution.predicted, len(solution.x))
         rows = zip(misfit.observations, residuals, deviations, misfit.signals, strict=True)
@@ -196,7 +196,7 @@ class Search:
 
     def refine(self, start: Array) -> Solution:
         """Return the minimum from a start, shape (n,); alternate with the estimation of an unknown sigma."""
-        misfit = self._misfit
+        misfit = self.misfit
         is_unknown = any(observed.sigma is None for observed in misfit.observations)
         scales = misfit.scales(misfit.signals)
         if misfit.robust and is_unknown and (predicted := self._predict(start)) is not None:
@@ -219,13 +219,13 @@ class Search:
             predicted = self._predict(x)
             # SciPy reduces its step after a NaN.
             if predicted is None:
-                return np.full(sum(self._misfit.count), np.nan)
-            return self._misfit.residuals(predicted, scales)
+                return np.full(sum(self.misfit.count), np.nan)
+            return self.misfit.residuals(predicted, scales)
 
         def jacobian(x: Array) -> Array:
             predicted = self._predict(x)
             assert predicted is not None
-            return self._misfit.scaled(self._differences(x, predicted, signs=(1,)), scales)
+            return self.misfit.scaled(self._differences(x, predicted, signs=(1,)), scales)
 
         with np.errstate(all="ignore"):  # SciPy divides by gradients that are 0.
             result = least_squares(
@@ -236,7 +236,7 @@ class Search:
                 ftol=1e-6,
                 xtol=1e-8,
                 gtol=1e-12,
-                loss="soft_l1" if self._misfit.robust else "linear",
+                loss="soft_l1" if self.misfit.robust else "linear",
                 f_scale=OUTLIER_SIGMAS,
                 max_nfev=40,
             )
@@ -270,11 +270,11 @@ class Search:
                 remedy = "give --bounds or another start by --set"
                 raise SceneError([f"{parameter.key}: no run close to its value succeeds; {remedy}"])
             (x_first, first), (x_second, second) = [*sides, (x[n], predicted)][:2]
-            columns.append((self._misfit.vector(first) - self._misfit.vector(second)) / (x_first - x_second))
+            columns.append((self.misfit.vector(first) - self.misfit.vector(second)) / (x_first - x_second))
         return np.stack(columns, axis=1)
 
     def _cost(self, predicted: Prediction, scales: Scales) -> float:
-        return self._misfit.cost(self._misfit.residuals(predicted, scales))
+        return self.misfit.cost(self.misfit.residuals(predicted, scales))
 
     def alternative_starts(self) -> list[Array]:
         """Return a Sobol sequence of starts within the bounds, at least 8 per parameter, or 8 for machine tests."""

@@ -108,6 +108,10 @@ class Observation(ABC):
             raise SceneError([f"{self.name}: sigma: {shown}; {remedy}"])
         return replace(self, sigma=value)
 
+    def without(self, samples: NDArray[np.bool_]) -> Self:
+        """Return the observation without samples, a mask with the shape of the values without components."""
+        return replace(self, values=np.where(samples[..., None], np.nan, self.values))
+
     @abstractmethod
     def build_model(self, scene: Scene, frames: int) -> ObservationModel:
         """Return the map from a run to the values.
@@ -171,11 +175,12 @@ class Observation(ABC):
         """Yield a message if another unit explains the ratio of observed values to all predictions."""
         yield from ()
 
-    def pattern(self, residuals: Array, signal: float, correlation: ErrorCorrelation) -> str | None:
+    def pattern(self, scene: Scene, predicted: Array, signal: float, correlation: ErrorCorrelation) -> str | None:
         """Return the reason to reject the model for a pattern in the residuals, or None.
 
         Args:
-            residuals: predicted minus observed values, with the shape of `values`.
+            scene: scene with the camera.
+            predicted: values predicted by the solution, with the shape of `values`.
             signal: root mean square from `signal` [unit].
             correlation: given correlation of the errors.
         """

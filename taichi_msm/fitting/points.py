@@ -231,10 +231,10 @@ class PointObservation(Observation):
             fault = f"the motion in {'xyz'[axis]} is opposite to the scene's; is its sign wrong, or that of the tool?"
             yield f"{self.subject}: {fault} change the sign of {'xyz'[axis]}, or of the force or path"
 
-    def pattern(self, residuals: Array, signal: float, correlation: ErrorCorrelation) -> str | None:
-        return rejection.by_pattern(
-            residuals, self.time, self.coordinates, signal, correlation, self.correlation_remedy or "give --sigma"
-        )
+    def pattern(self, scene: Scene, predicted: Array, signal: float, correlation: ErrorCorrelation) -> str | None:
+        remedy = self.correlation_remedy or "give --sigma"
+        residuals, displacement = predicted - self.values, predicted - self.at_rest(scene)
+        return rejection.by_pattern(residuals, displacement, self.time, self.coordinates, signal, correlation, remedy)
 
     def correlated(self, rows: Array, correlation: ErrorCorrelation) -> tuple[Array, float]:
         from scipy.spatial.distance import cdist

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from taichi_msm.fitting.machine_fit import FittedTest
 from taichi_msm.fitting.observation import Array, Observation
+from taichi_msm.fitting.outliers import LeftOut
 from taichi_msm.fitting.parameters import rounded
 from taichi_msm.fitting.points import PointObservation
 from taichi_msm.fitting.profiles import ProfilePoint
@@ -125,7 +126,8 @@ class FitResult:
         seconds: duration [s].
         notes: warnings, a line each.
         scene: fitted scene; a map refers to map.png in the given directory.
-        observations: the observations.
+        observations: the observations, of a robust fit without outliers.
+        left_out: outliers of every observation of a robust fit of points.
         fitted: values of every observation, predicted by the fitted scene.
         curves: profiles of the parameters by key, or their quadratic approximations.
         map: estimated map, or None for a fit of numbers.
@@ -152,6 +154,7 @@ class FitResult:
     scene: Scene = field(repr=False)
     observations: tuple[Observation, ...] = field(repr=False)
     fitted: tuple[Array, ...] = field(repr=False)
+    left_out: list[LeftOut] = field(repr=False, default_factory=list)
     curves: dict[str, list[ProfilePoint]] = field(repr=False, default_factory=dict)
     map: FittedMap | None = None
     tests: tuple[FittedTest, ...] = ()
@@ -173,6 +176,7 @@ class FitResult:
             "parameters": {key: item._asdict() for key, item in self.parameters.items()},
             **{name: getattr(self, name) for name in names.split()},
             "unseen": [item.as_json() for item in self.unseen],
+            **({"left_out": [item.as_json() for item in self.left_out]} if self.left_out else {}),
             **({} if self.map is None else {"map": self.map.as_json()}),
             **({"tests": [fitted.as_json() for fitted in self.tests]} if self.tests else {}),
         }
@@ -203,6 +207,7 @@ class FitResult:
                 points, times = observed.is_observed.shape
                 residual = f"residual {self.residual:.3g} {self.unit} of {points} points at {times} times"
                 lines.append(f"{residual}{force_text}{chi_text}")
+        lines += [str(item) for item in self.left_out]
         if self.mesh_error is not None:
             qualifier = "at most about " if any(probe.moved for probe in self.scene.probes) else ""
             error = f"{qualifier}{rounded(100 * self.mesh_error)} % of the largest displacement"

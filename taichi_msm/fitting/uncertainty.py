@@ -40,6 +40,9 @@ MAX_DIRECTION_DEVIATION = 0.5
 # Smaller components of unidentified directions are 0; larger ones than the second make a parameter unidentified.
 MIN_COMPONENT, MIN_GROUP_COMPONENT = 1e-3, 0.05
 
+# Largest correlation of parameters with symmetric intervals.
+MAX_CORRELATION = 0.9
+
 # Largest standard error of an identifiable parameter, as a share of its value or of a coordinate's range.
 MAX_RELATIVE_ERROR = 1.0
 
@@ -102,6 +105,12 @@ class Uncertainty:
     def unidentified(self) -> NDArray[np.bool_]:
         """Mask of the parameters in unidentified directions, where `shift` is invalid, shape (n,)."""
         return np.linalg.norm(self.unidentified_directions, axis=1) > MIN_GROUP_COMPONENT
+
+    @property
+    def is_correlated(self) -> NDArray[np.bool_]:
+        """Mask of the identifiable parameters that are strongly correlated with another one, shape (n,)."""
+        others = np.abs(self.correlation) - np.eye(len(self.root))
+        return np.asarray((others.max(axis=1) > MAX_CORRELATION) & (self.deviations <= MAX_RELATIVE_ERROR))
 
     def shift(self, errors: Array) -> Array:
         """Return the shift of x, shape (n,), due to errors of the predictions, shape (known,), in units of r."""

@@ -1,4 +1,4 @@
-"""Readers of the cells of text tables and workbooks, and parser of their numbers.
+"""Cells of tables, reader of text tables, and parser of numbers.
 
 Texts are UTF-8, UTF-16 or Windows-1252; their separator is detected from the header.
 """
@@ -7,25 +7,20 @@ from __future__ import annotations
 
 import codecs
 import csv
-import datetime
-import io
 import re
-import warnings
-import zipfile
 from collections.abc import Callable, Iterable, Sequence
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
 
-from taichi_msm.errors import NotInstalledError, SceneError
+from taichi_msm.errors import SceneError
 from taichi_msm.images import irregular_kind
 from taichi_msm.scene.section import MAX_MAGNITUDE
 
 Row = list[str]
 
-# Largest size of a file and of an unpacked workbook [bytes], and largest number of cells of a sheet.
-MAX_BYTES, MAX_UNPACKED_BYTES, MAX_CELLS = 2**26, 2**29, 10**7
+# Largest size of a file [bytes], and number of lines of a text.
+MAX_BYTES, MAX_LINES = 2**26, 2**23
 
 WORKBOOK_SUFFIX = ".xlsx"
 
@@ -34,6 +29,8 @@ SEPARATORS = {"tabs": "\t", "semicolons": ";", "commas": ",", "bars": "|", "wide
 
 # Patterns of the spaces between titles; a single space before a unit in brackets does not separate.
 SPACES = {"wide spaces": re.compile(r"\s{2,}"), "spaces": re.compile(r"\s+(?![\[(])")}
+
+LINE_END = re.compile(r"\r\n|\r|\n")
 
 # Letter other than e, which numbers contain.
 LETTER = re.compile(r"[^\W\d_eE]")
@@ -56,7 +53,7 @@ class Grid:
         rows: cells of every row, without empty ones at the end.
         separator: key of `SEPARATORS`, empty for a workbook.
         counts: number of cells of every row of a text, including empty ones at the end.
-        merged: (row, column) of every cell that is merged with its right neighbour.
+        merged: (first row, last row, column) of cells that are merged with their right neighbours.
     """
 
     name: str
@@ -64,7 +61,7 @@ class Grid:
     rows: list[Row]
     separator: str = ""
     counts: Sequence[int] = ()
-    merged: frozenset[tuple[int, int]] = frozenset()
+    merged: list[tuple[int, int, int]] = field(default_factory=list)
 
     @property
     def title(self) -> str:
@@ -80,9 +77,14 @@ class Grid:
         """
         if not self.sheet:
             return f"{self.name}:{row + 1}"
-        from openpyxl.utils import get_column_letter
+        letters = ""
+        while column >= 0:
+            letters, column = chr(ord("A") + column % 26) + letters, column // 26 - 1
+        return f"{self.name}: {self.sheet}!{letters}{row + 1}"
 
-        return f"{self.name}: {self.sheet}!{get_column_letter(column + 1)}{row + 1}"
+    def merged_columns(self, row: int) -> list[int]:
+        """Return the columns of a row that are merged with their right neighbours."""
+        return [column for first, last, column in self.merged if first <= row <= last]
 
     def has_content(self, row: int) -> bool:
         """Return whether a row has letters or digits, and is not a comment of a text."""
@@ -121,15 +123,14 @@ class Grid:
         numbers, known_mark = [], ""
         for row, column in cells:
             cell = self.rows[row][column]
-            where = f"{self.place(row, column)}: {self.rows[header][column]}: {cell[:40]!r}"
-            if (number := parse_number(cell)) is None:
-                if cell.startswith("="):
-                    remedy = "calculate and save the workbook"
-                    where += ", a formula without a saved value"
+            number, mark = parse_number(cell), decimal_mark(cell)
+            if number is None or (mark and known_mark not in ("", mark)):
+                where = f"{self.place(row, column)}: {self.rows[header][column]}: {cell[:40]!r}"
+                if number is not None:
+                    where, remedy = f"{where}; the table has both . and , as decimal marks", "take one"
+                elif cell.startswith("="):
+                    where, remedy = f"{where}, a formula without a saved value", "calculate and save the workbook"
                 raise SceneError([f"{where}; {remedy}"])
-            mark = decimal_mark(cell)
-            if mark and known_mark not in ("", mark):
-                raise SceneError([f"{where}; the table has both . and , as decimal marks; take one"])
             known_mark = mark or known_mark
             numbers.append(number)
         return numbers
@@ -146,53 +147,26 @@ def read_text(name: str, is_header: Callable[[Row], bool], expected: str) -> Gri
     Raises:
         SceneError: when the file cannot be read, or is not a text.
     """
-    rows, counts, separator = [], [], ""
-    lines = re.split(r"\r\n|\r|\n", _decode(name, _read_bytes(name, expected), expected))
+    rows, counts, separator, numbers_row, numbers = [], [], "", -1, dict[str, list[bool]]()
+    data = read_bytes(name, expected)
+    if (count := max(data.count(b"\n"), data.count(b"\r"))) > MAX_LINES:
+        raise SceneError([f"{name}: {count:,} lines, above {MAX_LINES:,}; delete lines without cells"])
+    lines = LINE_END.split(_decode(name, data, expected))
     for n, line in enumerate(lines):
         headers = {}
         if LETTER.search(line):
-            headers = {key: row for key in SEPARATORS if is_header(row := _split_header(line, key))}
+            splits = {key: _split_header(line, key) for key, mark in SEPARATORS.items() if mark in line}
+            headers = {key: row for key, row in splits.items() if is_header(row)}
         if headers:
-            separator = _choose_separator(headers, lines[n + 1 :])
-        cells = headers[separator] if headers else _split_line(line, separator)
+            if numbers_row < n:
+                numbers_row, numbers = _find_numbers(lines, n + 1)
+            # The first separator that splits the next line of numbers into at least three, or else the first one.
+            suitable = (key for key, row in headers.items() if sum(numbers[key][: len(row)]) >= 3)
+            separator = next(suitable, next(iter(headers)))
+        cells = headers[separator] if headers else _split_line(line, separator) if line else []
         rows.append(_strip(cells))
         counts.append(len(cells))
     return Grid(name, "", rows, separator, counts)
-
-
-def read_workbook(name: str, expected: str) -> dict[str, Grid]:
-    """Return the worksheets of a workbook by name.
-
-    Args:
-        name: path of the file.
-        expected: description of a readable file, for messages.
-
-    Raises:
-        SceneError: when the file cannot be read, or is not a workbook.
-        NotInstalledError: when openpyxl is not installed.
-    """
-    try:
-        import openpyxl
-    except ImportError:
-        raise NotInstalledError(f"{name}: needs openpyxl, which is not installed; pip install openpyxl") from None
-    data = _read_bytes(name, expected)
-    try:
-        with zipfile.ZipFile(io.BytesIO(data)) as archive:
-            unpacked = sum(entry.file_size for entry in archive.infolist())
-        if unpacked > MAX_UNPACKED_BYTES:
-            raise SceneError([f"{name}: {unpacked / 1e6:.0f} MB unpacked; save the sheet as CSV"])
-        # openpyxl warns about ignored parts, such as styles.
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")
-            # Saved values, and formulas where no value was saved.
-            values, formulas = (openpyxl.load_workbook(io.BytesIO(data), data_only=saved) for saved in (True, False))
-        return {sheet.title: _read_sheet(name, sheet, formulas[sheet.title]) for sheet in values.worksheets}
-    except SceneError:
-        raise
-    # openpyxl raises errors of any kind for a damaged file.
-    except Exception as error:
-        reason = f"not a workbook, or a damaged one ({type(error).__name__})"
-        raise SceneError([f"{name}: {reason}; save it again as .xlsx, or as CSV"]) from None
 
 
 def parse_number(cell: str) -> tuple[float, int] | None:
@@ -215,32 +189,6 @@ def decimal_mark(cell: str) -> str:
     return "," if cell.rfind(",") > cell.rfind(".") else "." if "." in cell else ""
 
 
-def _read_sheet(name: str, sheet: Any, formulas: Any) -> Grid:
-    """Read the cells of a worksheet as strings."""
-    if (cells := sheet.max_row * sheet.max_column) > MAX_CELLS:
-        raise SceneError([f"{name}: {sheet.title}: {cells} cells; delete the empty rows and columns around the table"])
-    rows = [
-        _strip([_format_cell(value if value is not None else formula) for value, formula in zip(*pair, strict=False)])
-        for pair in zip(sheet.iter_rows(values_only=True), formulas.iter_rows(values_only=True), strict=False)
-    ]
-    merged = frozenset(
-        (row - 1, block.min_col - 1)
-        for block in sheet.merged_cells.ranges
-        for row in range(block.min_row, min(block.max_row, len(rows)) + 1)
-        if block.max_col > block.min_col
-    )
-    return Grid(name, sheet.title, rows, merged=merged)
-
-
-def _format_cell(value: object) -> str:
-    """Format the value of a cell, numbers with the 15 digits of Excel."""
-    if isinstance(value, float):
-        return format(value, ".15g")
-    if isinstance(value, datetime.date | datetime.time | datetime.timedelta):
-        return f"a date or time of day, {value}"
-    return "" if value is None else str(value)
-
-
 def _strip(cells: Row) -> Row:
     """Normalise spaces, and drop empty cells at the end."""
     cells = [" ".join(cell.split()) for cell in cells]
@@ -249,15 +197,12 @@ def _strip(cells: Row) -> Row:
     return cells
 
 
-def _choose_separator(headers: dict[str, Row], lines: list[str]) -> str:
-    """Return the first separator that splits the next line of numbers into at least three; otherwise the first key."""
-    line = next((line for line in lines if line.strip() and not LETTER.search(line)), "")
-
-    def count(separator: str) -> int:
-        cells = _strip(_split_line(line, separator))[: len(headers[separator])]
-        return sum(parse_number(cell) is not None for cell in cells)
-
-    return next((separator for separator in headers if count(separator) >= 3), next(iter(headers)))
+def _find_numbers(lines: list[str], start: int) -> tuple[int, dict[str, list[bool]]]:
+    """Return the index of the next line of numbers, and whether its cells are numbers, by separator."""
+    found = (n for n in range(start, len(lines)) if lines[n].strip() and not LETTER.search(lines[n]))
+    index = next(found, len(lines))
+    line = lines[index] if index < len(lines) else ""
+    return index, {key: [parse_number(cell) is not None for cell in _split_line(line, key)] for key in SEPARATORS}
 
 
 def _split_header(line: str, separator: str) -> Row:
@@ -277,7 +222,7 @@ def _split_line(line: str, separator: str) -> Row:
     return [line]
 
 
-def _read_bytes(name: str, expected: str) -> bytes:
+def read_bytes(name: str, expected: str) -> bytes:
     """Read a file of at most `MAX_BYTES`."""
     try:
         if not (reason := irregular_kind(Path(name))):
@@ -292,18 +237,21 @@ def _read_bytes(name: str, expected: str) -> bytes:
 
 
 def _decode(name: str, data: bytes, expected: str) -> str:
-    """Decode a text; without a byte order mark, zero bytes mean UTF-16, and their parity its byte order."""
+    """Decode a text; without a byte order mark, zero bytes are the halves of the ASCII characters of UTF-16."""
     if data.startswith((b"PK", b"\xd0\xcf\x11\xe0")):
         raise SceneError([f"{name}: a workbook; {expected}"])
     if data.startswith((b"\xff\xfe", b"\xfe\xff")):
         encodings = ["utf-16"]
-    elif b"\0" in data:
-        encodings = ["utf-16-le" if data[1::2].count(0) > data[::2].count(0) else "utf-16-be"]
+    elif 4 * abs(zeros := data[1::2].count(0) - data[::2].count(0)) > len(data):
+        encodings = ["utf-16-le" if zeros > 0 else "utf-16-be"]
     else:
         # Windows programs of western Europe write cp1252; the numbers are ASCII in any encoding.
         data, encodings = data.removeprefix(codecs.BOM_UTF8), ["utf-8", "cp1252"]
     for encoding in encodings:
         with suppress(UnicodeDecodeError):
-            if "\0" not in (text := data.decode(encoding, "replace" if encoding == "cp1252" else "strict")):
+            text = data.decode(encoding, "replace" if encoding == "cp1252" else "strict")
+            if (zero := text.find("\0")) < 0:
                 return text
+            line = len(LINE_END.split(text[:zero]))
+            raise SceneError([f"{name}:{line}: a zero byte; remove it, or save the table as CSV in UTF-8"])
     raise SceneError([f"{name}: not a text; save it as CSV in UTF-8"])

@@ -10,6 +10,7 @@ import math
 import re
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
+from functools import lru_cache
 from itertools import pairwise, product
 from pathlib import Path
 
@@ -17,7 +18,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from taichi_msm.errors import SceneError, did_you_mean
-from taichi_msm.machines.cells import LETTER, WORKBOOK_SUFFIX, Grid, Row, parse_number, read_text, read_workbook
+from taichi_msm.machines.cells import LETTER, WORKBOOK_SUFFIX, Grid, Row, parse_number, read_text
+from taichi_msm.machines.workbook import read_workbook
 
 Array = NDArray[np.float64]
 
@@ -49,8 +51,17 @@ UNITS = {
 # Aliases of units, such as sec and g of texture analysers.
 UNIT_ALIASES = {"sec": "s", "g": "gf", "kg": "kgf", "µm": "um", "\N{GREEK SMALL LETTER MU}m": "um"}
 
-# Title with a unit: Time, s; Fz [gf]; Force (mN); Weg / mm; Force_N; Kraft in N.
-UNIT_PATTERN = re.compile(r"(.*?)[\s,/_\[(]+(?:in\s+)?([^\s,/_\[\]()]+)[\])]?")
+# Smallest ranges of a test, in SI units.
+MIN_RANGES = {"time": (1e-9, "s"), "depth": (1e-12, "m"), "force": (1e-15, "N")}
+
+# Longest title [characters].
+MAX_TITLE_LENGTH = 200
+
+# Reversed title with a unit: Time, s; Fz [gf]; Force (mN); Weg / mm; Force_N; Kraft in N.
+REVERSED_UNIT = re.compile(r"[\])]?([^\s,/_\[\]()]+)(?:\s+ni(?=[\s,/_\[(]))?[\s,/_\[(]+(.*)")
+
+# Words, and parts of a title in brackets.
+WORD, BRACKETS = re.compile(r"[^\W\d_]+"), re.compile(r"[(\[][^)\]]*[)\]]")
 
 # Start of a value, even an invalid one: a number, NaN, or an error or a formula of a workbook.
 VALUE_START = re.compile(r"[+\-\N{MINUS SIGN}]?[.,]?\d|[+-]?(nan|inf)|[#=]", re.ASCII | re.IGNORECASE)
@@ -109,7 +120,6 @@ def read_machine_test(
 
     Raises:
         SceneError: when the file has no such table, or several without a selection.
-        NotInstalledError: when the file is a workbook and openpyxl is not installed.
     """
     name, chosen = str(path), _parse_choices(columns)
     if name.lower().endswith(WORKBOOK_SUFFIX):
@@ -125,7 +135,7 @@ def read_machine_test(
     if not blocks:
         raise SceneError([_missing_header(grid, chosen)])
     if block is None and len(blocks) > 1:
-        listed = ", ".join(f"{n} (rows {part.header + 1} to {part.end})" for n, part in enumerate(blocks, 1))
+        listed = _listed([f"{n} (rows {part.header + 1} to {part.end})" for n, part in enumerate(blocks, 1)])
         raise SceneError([f"{grid.title}: {len(blocks)} blocks of rows; choose one by --block: {listed}"])
     if block is not None and not 1 <= block <= len(blocks):
         raise SceneError([f"--block {block}: {grid.title} has {len(blocks)}, numbered from 1"])
@@ -191,16 +201,22 @@ def _choose_sheet(name: str, sheets: dict[str, Grid], chosen: str | None, tables
     """Return the selected sheet of a workbook, or the only one with a table; `tables`: names of those with one."""
     if chosen is None:
         if len(tables) > 1:
-            raise SceneError([f"{name}: {len(tables)} sheets with a table; choose one by --sheet: {', '.join(tables)}"])
+            raise SceneError([f"{name}: {len(tables)} sheets with a table; choose one by --sheet: {_listed(tables)}"])
         if not tables and len(sheets) != 1:
-            remedy = f"choose one by --sheet: {', '.join(sheets)}" if sheets else "save one with cells"
+            remedy = f"choose one by --sheet: {_listed(list(sheets))}" if sheets else "save one with cells"
             raise SceneError([f"{name}: no sheet has a table of time, depth and force; {remedy}"])
         chosen = next(iter(tables or sheets))
     for title, grid in sheets.items():
         if title.casefold() == chosen.casefold():
             return grid
-    listed = ", ".join(tables or sheets)
+    listed = _listed(tables or list(sheets))
     raise SceneError([f"--sheet {chosen}: not in {name}{did_you_mean(chosen, sheets)}; it has {listed}"])
+
+
+def _listed(names: Sequence[str]) -> str:
+    """List at most 50 names."""
+    more = [f"and {len(names) - 50} more"] if len(names) > 50 else []
+    return ", ".join([*(name[:MAX_TITLE_LENGTH] for name in names[:50]), *more])
 
 
 def _find_blocks(grid: Grid, chosen: dict[str, str], min_rows: int = MIN_ROWS) -> list[_Block]:
@@ -225,7 +241,7 @@ def _find_blocks(grid: Grid, chosen: dict[str, str], min_rows: int = MIN_ROWS) -
 
 def _is_header(row: Row, chosen: dict[str, str]) -> bool:
     """Return whether a row has a title of every quantity, each in its own cell."""
-    if sum(bool(LETTER.search(cell)) for cell in row) < len(WORDS):
+    if len(row) < len(WORDS) or sum(bool(LETTER.search(cell)) for cell in row) < len(WORDS):
         return False
     candidates = _find_candidates(row, chosen).values()
     return any(len({*columns}) == len(columns) for columns in product(*candidates))
@@ -242,15 +258,23 @@ def _find_candidates(row: Row, chosen: dict[str, str]) -> dict[str, list[int]]:
             n for n, cell in enumerate(row) if name in (_fold(cell), _fold(_split_title(cell, quantity)[0]))
         ]
     taken = {column for columns in candidates.values() for column in columns}
+    titles = [n for n, cell in enumerate(row) if n not in taken and 0 < len(cell) <= MAX_TITLE_LENGTH]
     for quantity in WORDS.keys() - chosen.keys():
-        candidates[quantity] = [n for n, cell in enumerate(row) if n not in taken and _is_named(cell, quantity)]
+        candidates[quantity] = [n for n in titles if quantity in _named_quantities(row[n])]
     return {quantity: candidates[quantity] for quantity in WORDS}
 
 
-def _is_named(cell: str, quantity: str) -> bool:
-    """Return whether a title contains a word for a quantity, outside brackets."""
-    words = re.findall(r"[^\W\d_]+", re.sub(r"[(\[].*?[)\]]", " ", cell).casefold())
-    return bool(WORDS[quantity] & {*words}) or any(word.endswith(ENDINGS[quantity]) for word in words)
+@lru_cache(10_000)
+def _named_quantities(title: str) -> frozenset[str]:
+    """Return the quantities whose words a title contains, outside brackets."""
+    # Without closing brackets, `BRACKETS` takes quadratic time.
+    end = max(title.rfind(")"), title.rfind("]")) + 1
+    words = WORD.findall((BRACKETS.sub(" ", title[:end]) + title[end:]).casefold())
+    return frozenset(
+        quantity
+        for quantity, ending in ENDINGS.items()
+        if WORDS[quantity] & {*words} or any(word.endswith(ending) for word in words)
+    )
 
 
 def _fold(text: str) -> str:
@@ -270,9 +294,9 @@ def _unit_factor(quantity: str, unit: str) -> float | None:
 
 def _split_title(title: str, quantity: str) -> tuple[str, float | None]:
     """Split a title into its name and the factor of its unit; None without a unit of the quantity."""
-    match_ = UNIT_PATTERN.fullmatch(title)
-    scale = _unit_factor(quantity, match_[2]) if match_ else None
-    return (match_[1], scale) if match_ and scale is not None else (title, None)
+    match_ = REVERSED_UNIT.fullmatch(title[::-1])
+    scale = _unit_factor(quantity, match_[1][::-1]) if match_ else None
+    return (match_[2][::-1], scale) if match_ and scale is not None else (title, None)
 
 
 def _split_choice(title: str, quantity: str) -> tuple[str, float | None]:
@@ -296,10 +320,12 @@ def _read_block(grid: Grid, block: _Block, chosen: dict[str, str]) -> MachineTes
         n = int(still[0])
         fault = f"{time[n + 1]:.9g} s after {time[n]:.9g} s; time must increase: delete the row, or split the file"
         raise SceneError([f"{grid.place(rows[n + 1], columns[0].index)}: {columns[0].title}: {fault}"])
-    for quantity, column, values in (("depth", columns[1], depth), ("force", columns[2], force)):
-        if not np.ptp(values):
-            remedy = f'choose another column by --columns "{quantity}=NAME, UNIT"'
-            raise SceneError([f"{grid.place(block.header, column.index)}: {column.title}: never changes; {remedy}"])
+    for quantity, column, values in zip(WORDS, columns, (time, depth, force), strict=True):
+        least, unit = MIN_RANGES[quantity]
+        if (extent := np.ptp(values)) < least:
+            fault = f"changes by only {extent:.3g} {unit}" if extent else "never changes"
+            remedy = f'choose another column or unit by --columns "{quantity}=NAME, UNIT"'
+            raise SceneError([f"{grid.place(block.header, column.index)}: {column.title}: {fault}; {remedy}"])
     digit = 10.0 ** min(power for _, power in parsed[2 :: len(columns)]) * columns[2].scale
     return MachineTest(grid.title, time, depth, force, digit, tuple(notes))
 
@@ -321,9 +347,9 @@ def _select_columns(grid: Grid, block: _Block, chosen: dict[str, str]) -> tuple[
     for quantity, candidates in _find_candidates(titles, chosen).items():
         given, columns = _split_choice(chosen.get(quantity, ""), quantity)[1], []
         for index in candidates:
-            scale = _split_title(titles[index], quantity)[1]
-            if scale is None and index < len(units):
-                scale = _unit_factor(quantity, units[index])
+            scale = _unit_factor(quantity, units[index]) if index < len(units) else None
+            if scale is None:
+                scale = _split_title(titles[index], quantity)[1]
             if given is not None and scale not in (None, given):
                 title = chosen[quantity]
                 notes.append(f"{grid.title}: {quantity} is read as {title!r}, although the file has another unit")
@@ -339,10 +365,15 @@ def _select_columns(grid: Grid, block: _Block, chosen: dict[str, str]) -> tuple[
         if (repeated := sum(column.title == best.title for column in columns)) > 1:
             fault = f"{repeated} columns of this name; rename or delete all but one"
             raise SceneError([f"{grid.place(header, best.index)}: {best.title}: {fault}"])
-        if (header, best.index) in grid.merged:
+        if best.index in grid.merged_columns(header):
             raise SceneError([_describe_merged(grid, header, best.index)])
+        unit = units[best.index] if best.index < len(units) else ""
+        title_scale, scale = _split_title(best.title, quantity)[1], _unit_factor(quantity, unit)
+        if given is None and unit and title_scale not in (None, scale):
+            reason = f"not a unit of {quantity}; so it is in that of its title" if scale is None else "its unit"
+            notes.append(f"{grid.title}: {best.title!r}: {unit[:40]!r} in the row below is {reason}")
         if others := [column.title for column in columns if column != best]:
-            than = " and ".join(map(repr, others))
+            than = " and ".join(map(repr, others[:5]))
             notes.append(f"{grid.title}: {quantity} is {best.title!r}, as it starts nearer 0 than {than}")
         selected.append(best)
     return selected, notes
@@ -356,7 +387,7 @@ def _missing_header(grid: Grid, chosen: dict[str, str]) -> str:
     cells = [row if grid.sheet else re.split(r"[\t;,|]", ";".join(row)) for row in grid.rows]
     named = [{quantity for quantity, columns in _find_candidates(row, chosen).items() if columns} for row in cells]
     best = max(range(len(named)), key=lambda row: len(named[row]))
-    if merged := [column for row, column in grid.merged if row == best and named[best]]:
+    if named[best] and (merged := grid.merged_columns(best)):
         return _describe_merged(grid, best, min(merged))
     shown = f"{grid.place(best)}: {', '.join(grid.rows[best])[:100]!r}"
     missing = [quantity for quantity in WORDS if quantity not in named[best]]
