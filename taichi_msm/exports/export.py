@@ -27,6 +27,7 @@ from taichi_msm.errors import (
     writing,
 )
 from taichi_msm.exports.formats import ANY_CAMERA, FORMATS, ExportSource, FormatWriter, read_runs
+from taichi_msm.images import PictureError
 from taichi_msm.runs.directory import (
     Publication,
     PublicationSpec,
@@ -191,8 +192,9 @@ def _name_run_in_errors(run: FinishedRun, name: str) -> Iterator[None]:
         with np.errstate(over="raise", divide="raise", invalid="raise"):
             yield
     except SceneError as error:
-        # The remedy of the SceneError, to change the scene, does not apply to a finished run.
-        fault = error.lines[0].partition(";")[0]
+        # The remedy of a picture, to change the scene, does not apply to a finished run.
+        cause = error.__cause__
+        fault = f"image: {cause.fault}" if isinstance(cause, PictureError) else error.lines[0]
         raise FilesError(f"{run.directory}: {fault}; {RESTORE_PICTURE}") from None
     except FloatingPointError:
         raise FilesError(f"{run.directory}: its numbers are too large for {name}; run the scene again") from None

@@ -29,7 +29,7 @@ def load_texture(scene: Scene, sha256: str | None = None) -> NDArray[np.uint8]:
         key = digest, digest if sha256 is None else sha256, scene.render.background, scene.region
         (texture,) = cached_arrays(("texture", *key), lambda: (_read(scene, key[1]),))
     except PictureError as error:
-        raise SceneError([f"image: {error}"]) from None
+        raise SceneError([f"image: {error}"]) from error
     return texture
 
 

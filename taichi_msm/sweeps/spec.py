@@ -430,7 +430,7 @@ def _unknown_keys(scene: scene_file.ParsedFile, vary: dict[str, Any], fixed: dic
         draft.override(scene_file.Override("", key, deepcopy(value)))
         yield from (Problem(path, problem.message) for _, problem in draft.problems[earlier:])
     for problem in parse_model(Scene, draft.data)[1]:
-        if not problem.message.startswith("unknown key"):
+        if not problem.is_unknown_key:
             continue
         # The unknown key is the beginning of a tried key, a key within its value, or a key of the scene file.
         related = [

@@ -236,7 +236,7 @@ def test_uncertainty_of_the_offsets() -> None:
         assert fitted.offset_error == pytest.approx(np.sqrt(found.factor * covariance[2 + n, 2 + n]))
         assert abs(fitted.loading.offset - (0.2, -0.3)[n]) < 4 * fitted.offset_error
         np.testing.assert_allclose(fitted.loading.force, given.force - expected[2 + n])
-    for n, profile in enumerate(Profiler(runs, misfit, solution, found).profiles()):  # type: ignore[arg-type]
+    for n, profile in Profiler(runs, misfit, solution, found).profiles([0, 1]).items():  # type: ignore[arg-type]
         half_width = found.quantile * found.deviations[n]
         # Ends have a relative tolerance of 0.05.
         assert profile.low == pytest.approx(expected[n] - half_width, abs=0.05 * half_width)
