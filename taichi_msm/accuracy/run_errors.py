@@ -11,6 +11,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from taichi_msm.accuracy.buckling import buckling_warnings
 from taichi_msm.accuracy.companions import NEGLIGIBLE_ERROR, QUASISTATIC_REASON, CompanionRuns
 from taichi_msm.accuracy.contact_warnings import tool_contact_warnings
 from taichi_msm.accuracy.divergence import energy_growth_warnings
@@ -243,6 +244,7 @@ def run_warnings(
     tool_warnings = list(path_warnings(scene, plan.tools))
     yield from tool_warnings
     yield from tool_contact_warnings(plan, progress)
+    yield from buckling_warnings(plan, progress)
     yield from energy_growth_warnings(plan, progress)
     if mesh is not None and mesh.doubt and mesh.error < math.inf:
         yield f"the mesh error may be larger: {mesh.doubt}"
@@ -322,7 +324,9 @@ def _digits(number: float, digits: int = 1) -> str:
 def _mesh_remedy(plan: Plan, mesh: MeshEstimate, affords: Callable[[Plan], bool]) -> str:
     """Suggest a remedy for the mesh error: a finer mesh with at most `MAX_POINTS_RATIO` times the mass points."""
     if mesh.doubt == WRINKLING:
-        return "set tissue.bending or tissue.pretension; without them, a finer mesh has finer wrinkles"
+        return (
+            "hold every side and set tissue.bending or tissue.pretension; without them, a finer mesh has finer wrinkles"
+        )
     refinement = min(math.sqrt(mesh.error / (REMEDY_THRESHOLD / 2)), math.sqrt(MAX_POINTS_RATIO))
     rows, cols = (math.ceil((count - 1) * refinement) + 1 for count in plan.scene.sheet.points)
     if max(rows, cols) < MAX_POINTS and affords(plan_variant(plan, with_points(plan.scene, (rows, cols)))):
