@@ -185,9 +185,11 @@ class MeshCompanion:
         self._differences = [0.0 for _ in plans]
         self._sampling_error = _sampling_force_error(plan.scene)
         self._contact = plan.has_contact
-        self._overlap = overlap(plan.tools, plan.scene.time.duration) is not None
         cell = max(spacing(plan.scene.sheet))
-        self._narrow = any(tool.radius < MIN_RADIUS_CELLS * cell for tool in touching_tools(plan.tools))
+        narrow = any(tool.radius < MIN_RADIUS_CELLS * cell for tool in touching_tools(plan.tools))
+        overlaps = overlap(plan.tools, plan.scene.time.duration) is not None
+        # Reason for an unknown error that does not depend on the companion runs.
+        self._unknown = NARROW_TIP if narrow else OVERLAP if overlaps else ""
         self._largest, self._shortest_spring = 0.0, 1.0
         self._second_run: MeshCompanion | None = None
 
@@ -229,7 +231,7 @@ class MeshCompanion:
             device: device to run on.
             cores: number of CPU cores for stepping; None for all.
         """
-        if self._contact and not self._narrow and self._relative_difference > SECOND_RUN_DIFFERENCE:
+        if self._contact and not self._unknown and self._relative_difference > SECOND_RUN_DIFFERENCE:
             coarse = coarser_plan(plan, SECOND_CELL_RATIO)
             self._second_run = None if coarse is None else MeshCompanion(plan, coarse, device, cores)
         return self._second_run
@@ -269,15 +271,14 @@ class MeshCompanion:
 
     def _contact_estimate(self, difference: float) -> MeshEstimate:
         """Estimate the error from the relative difference of the first companion run."""
-        if self._narrow:
-            return MeshEstimate(math.inf, NARROW_TIP)
+        if self._unknown:
+            return MeshEstimate(math.inf, self._unknown)
         error = CONTACT_ERROR_FACTOR * difference
         if difference > SECOND_RUN_DIFFERENCE:
             if self._second_run is None or not self._second_run._relative_difference <= MAX_DIFFERENCE:
                 return MeshEstimate(math.inf, NOT_CONVERGED)
             error = SECOND_ERROR_FACTOR * math.sqrt(difference * self._second_run._relative_difference)
-        doubt = OVERLAP if self._overlap else WRINKLING if self._may_wrinkle else ""
-        return MeshEstimate(error + self._sampling_error, doubt, at_most=True)
+        return MeshEstimate(error + self._sampling_error, WRINKLING if self._may_wrinkle else "", at_most=True)
 
 
 def with_points(scene: Scene, points: tuple[int, int]) -> Scene:
@@ -331,10 +332,12 @@ def choose_points(
         if needed > max_refinement:
             break
         refinement *= min(MAX_CELL_REFINEMENT, max(1.1, needed / refinement))
+    reached = f"sheet.tolerance: {tolerance:g} is out of reach: with {rows} x {cols} points the error is "
+    if estimate.error == math.inf:
+        raise SceneError([f"{reached}not known: {estimate.doubt}; change the paths, or leave out sheet.tolerance"])
     raise SceneError(
         [
-            f"sheet.tolerance: {tolerance:g} is out of reach: with {rows} x {cols} points the error is "
-            f"{estimate.error:.2g}, and no sheet has more than {MAX_POINTS} points a side; take a wider tool "
+            f"{reached}{estimate.error:.2g}, and no sheet has more than {MAX_POINTS} points a side; take a wider tool "
             "(probes.N.radius, a smaller falloff), tissue.pretension or bending where it wrinkles and every side is "
             "fixed, or a larger tolerance"
         ]

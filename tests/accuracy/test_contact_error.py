@@ -14,9 +14,17 @@ from PIL import Image
 
 from taichi_msm.accuracy import time_step
 from taichi_msm.accuracy.companions import choose_companion_runs
-from taichi_msm.accuracy.mesh import OVERLAP, MeshEstimate, estimate_mesh_error, mesh_companion_plan, with_points
-from taichi_msm.accuracy.run_errors import RunErrorEstimates, RunErrorEstimator
+from taichi_msm.accuracy.mesh import (
+    OVERLAP,
+    MeshEstimate,
+    choose_points,
+    estimate_mesh_error,
+    mesh_companion_plan,
+    with_points,
+)
+from taichi_msm.accuracy.run_errors import ForceEstimate, RunErrorEstimates, RunErrorEstimator
 from taichi_msm.accuracy.time_step import TimeStepEstimate, choose_step, combine_estimates, max_norm
+from taichi_msm.errors import SceneError
 from taichi_msm.model.plan import Plan
 from taichi_msm.model.tools import overlap, path_warnings
 from taichi_msm.model.verlet import convergence_order
@@ -85,8 +93,7 @@ def test_mesh_estimate_bounds_the_error(seed: int, image: str, device: Device) -
     mesh = estimates_of(plan, device).mesh
     assert mesh.at_most or mesh.error == math.inf
     error = true_mesh_error(plan.with_grid(precision="f64"), device, refinement=4, steps=8)
-    # The bound of tools that run through each other is rough.
-    assert error <= (4 if mesh.doubt == OVERLAP else 2 if mesh.doubt else 1.5) * mesh.error
+    assert error <= (2 if mesh.doubt else 1.5) * mesh.error
 
 
 TISSUE = {"young": 3e4, "thickness": 2e-3, "density": 1050, "foundation": 1.3e5, "damping": 200, "pretension": 40}
@@ -204,15 +211,18 @@ def test_overlap_of_random_capsules() -> None:
             assert overlap(plan_of(touching(probes)).tools, 0.4) == expected, probes
 
 
-@pytest.mark.slow
-def test_estimate_with_overlapping_tools_is_a_lower_bound(device: Device, message: Messages) -> None:
+def test_mesh_error_of_overlapping_tools_is_unknown(device: Device, message: Messages) -> None:
     meets = moved([0, 0.8, 0.5, 0.01], [0.2, 0.55, 0.5, -0.02])
     plan = plan_of(touching([PRESSED, meets], time={"duration": 0.2}))
     notes = [note for note in path_warnings(plan.scene, plan.tools) if "through each other" in note]
     message(notes, "probes.0 and probes.1: ")
     estimates = estimates_of(plan, device)
     assert estimates.time_step.at_least
-    assert estimates.mesh.doubt == OVERLAP
+    assert estimates.mesh == MeshEstimate(math.inf, OVERLAP)
+    assert estimates.force == ForceEstimate(None, OVERLAP)
+    searched = plan_variant(plan, plan.scene.model_copy(update={"sheet": {**dict(plan.scene.sheet), "tolerance": 0.1}}))
+    with message.raises(SceneError, "sheet.tolerance"):
+        choose_points(searched, device, lambda made, _: plan_of(made))
 
 
 def test_mesh_companion_is_compared_with_the_run(device: Device, monkeypatch: pytest.MonkeyPatch) -> None:
