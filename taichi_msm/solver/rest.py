@@ -223,7 +223,7 @@ class QuasiStatics(SheetSolver[Relaxation]):
         relaxation.stop()
         per_launch = max(1, min(64, POINT_STEPS_PER_LAUNCH // (rows * cols)))
         laws = self.plan.material.stiffening, self.plan.material.virtual_stiffening
-        steepest = max(1.0 if law is None else law.factor for law in laws)
+        steepest = max(law.largest_slope if law else 1.0 for law in laws)
         limit = math.ceil(MAX_EVALUATIONS * max(rows, cols) * math.sqrt(steepest))
         max_evaluations, evaluations = limit, 0
         perturbed, stability_evaluations = tolerance >= PERTURBATION_TOLERANCE, math.inf
