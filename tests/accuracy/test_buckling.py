@@ -14,7 +14,7 @@ from taichi_msm.system.runtime import Device
 from tests.golden import Messages
 from tests.scenes import scene
 
-FOUNDATION = {"foundation": 1e4, "foundation_active": "always"}
+FOUNDATION: dict[str, Any] = {"foundation": 1e4, "foundation_active": "always"}
 
 
 def strip(motion: str, shift: float, across: float = 0.0, **tissue: Any) -> Scene:
