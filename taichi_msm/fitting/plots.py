@@ -39,12 +39,7 @@ Panel = Callable[[Axes], None]
 
 
 def plot(result: FitResult, file: BinaryIO) -> None:
-    """Write fit.png.
-
-    Args:
-        result: result of the fit.
-        file: binary file for the PNG.
-    """
+    """Write fit.png."""
     with style.context(STYLE, after_reset=True), warnings.catch_warnings():
         # A name may contain characters that the font lacks, and a point may have no observations.
         warnings.filterwarnings("ignore", "Glyph .* missing")
@@ -72,13 +67,7 @@ def _figure(result: FitResult) -> Figure:
 
 
 def observation_panels(observed: Observation, fitted: Array, result: FitResult) -> list[Panel]:
-    """Return the panels of an observation.
-
-    Args:
-        observed: the observation.
-        fitted: its values in the fitted scene, with their shape.
-        result: result of the fit.
-    """
+    """Return the panels of an observation; `fitted`: its values in the fitted scene."""
     if isinstance(observed, PointObservation):
         point_count, time_count = (int(observed.is_observed.any(axis=axis).sum()) for axis in (1, 0))
         # A single time shows no motion, a single point no map of residuals.
