@@ -60,10 +60,7 @@ class Approach:
     def place(self, data: dict[str, Any], travel: Array, rate: float) -> dict[str, Any]:
         """Return a scene's data with the path, duration and frame rate of a test.
 
-        Args:
-            data: data of a scene.
-            travel: distance from `start` at every frame [m], shape (frames,).
-            rate: frames per second.
+        `travel`: distance from `start` at every frame [m], shape (frames,).
         """
         (height, width), time = self.size, np.arange(len(travel)) / rate
         x, y, z = (self.start + travel[:, None] * self.direction).T
