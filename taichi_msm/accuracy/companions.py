@@ -25,6 +25,11 @@ MAX_STEP_RATIO = 64
 # the cells per side and 1/2 of the steps.
 MESH_COST, CONTACT_MESH_COST = 1 / 4 / 2 + 1 / 16 / 4, 1 / 2 / 2
 
+# Cells per side of the second companion run on a coarser mesh with contact, relative to the run; its steps are as long
+# relative to the stability limit, so that it does not become unstable before the run does.
+SECOND_CELL_RATIO = 0.85
+SECOND_MESH_COST = SECOND_CELL_RATIO**3
+
 # Reason for a missing estimate in a quasi-static scene, which has no time step.
 QUASISTATIC_REASON = "quasistatic"
 
@@ -38,6 +43,7 @@ class CompanionRuns(NamedTuple):
     mesh: bool = False  # whether there are companion runs on coarser meshes
     cost: float = 0.0  # cost of the parallel companion runs, in steps of the full sheet per step of the run
     reason: str = ""  # reason for a missing estimate of the time-step error; empty if there is one
+    second_mesh: bool = False  # whether a second run on a coarser mesh follows if the first, with contact, differs much
 
     @property
     def planned(self) -> bool:
@@ -54,7 +60,8 @@ def choose_companion_runs(plan: Plan, *, requested: bool = False) -> CompanionRu
     """
     if plan.scene.time.at_rest:
         mesh = plan.scene.tissue is not None and (requested or affords_companions(plan, MESH_COST))
-        return CompanionRuns(mesh=mesh, cost=MESH_COST if mesh else 0.0, reason=QUASISTATIC_REASON)
+        second = mesh and plan.has_contact and (requested or affords_companions(plan, MESH_COST + SECOND_MESH_COST))
+        return CompanionRuns(mesh=mesh, second_mesh=second, cost=MESH_COST if mesh else 0.0, reason=QUASISTATIC_REASON)
     steps, coarse, fine = plan.grid.steps_per_frame, coarse_steps(plan), fine_steps(plan)
     mesh_cost = (CONTACT_MESH_COST if plan.has_contact else MESH_COST) if plan.scene.tissue is not None else 0.0
     # For a run in f32, a fine companion run needs another one in f64 with the run's own steps.
@@ -70,12 +77,16 @@ def choose_companion_runs(plan: Plan, *, requested: bool = False) -> CompanionRu
         return CompanionRuns(
             reason="it would take more than two fifths of the run; to have it anyway, pass --estimate-error"
         )
-    if not coarse:
-        return CompanionRuns(fine, 0, mesh_cost > 0, cost)
     # Without stored positions, a subsequent companion run requires a repetition of the run.
     repetition = 0.0 if plan.scene.output else 1.0
-    follows = requested or affords_companions(plan, cost + fine_cost + repetition)
-    return CompanionRuns(coarse, fine if follows else 0, mesh_cost > 0, cost)
+
+    def affords(subsequent_cost: float) -> bool:
+        return requested or affords_companions(plan, cost + subsequent_cost + repetition)
+
+    second = mesh_cost > 0 and plan.has_contact and affords(SECOND_MESH_COST)
+    if not coarse:
+        return CompanionRuns(fine, 0, mesh_cost > 0, cost, second_mesh=second)
+    return CompanionRuns(coarse, fine if affords(fine_cost) else 0, mesh_cost > 0, cost, second_mesh=second)
 
 
 def coarse_steps(plan: Plan) -> int:

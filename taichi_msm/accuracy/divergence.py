@@ -117,6 +117,7 @@ class DivergenceMonitor:
                 energy=reading.energy,
                 reach=extreme.reach,
                 deepest=max(progress.deepest, -float(reading.displacement[..., 2].min())),
+                highest=max(progress.highest, float(reading.displacement[..., 2].max())),
                 peak=max(progress.peak, reading.energy),
                 residual=max(progress.residual, reading.residual),
                 evaluations=progress.evaluations + reading.evaluations,

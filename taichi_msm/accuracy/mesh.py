@@ -38,12 +38,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from taichi_msm.accuracy.companions import SECOND_CELL_RATIO
 from taichi_msm.accuracy.time_step import max_norm
 from taichi_msm.errors import DivergedError, Pause, ProgressCallback, SceneError
 from taichi_msm.model.plan import Plan
 from taichi_msm.model.sheet import MAX_CELL_ASPECT, Maps, cell_aspect_ratio, spacing
 from taichi_msm.model.tool_force import sum_probe_forces
-from taichi_msm.model.tools import overlap, touching_tools
+from taichi_msm.model.tools import overlap, reaches_sheet, touching_tools
 from taichi_msm.scene.scene import Scene
 from taichi_msm.scene.section import MAX_POINTS
 from taichi_msm.scene.sheet import Sheet
@@ -58,9 +59,12 @@ CONTACT_ORDER = 1.5
 # Companion runs with position-controlled tools; differences are relative to the largest displacement.
 CONTACT_CELL_RATIO = 1 / math.sqrt(2)  # cells per side of the first companion run, relative to the run
 CONTACT_ERROR_FACTOR = 1.2  # estimated error, as a multiple of the difference
-SECOND_RUN_DIFFERENCE = 0.4  # difference above which a second companion run follows
-SECOND_CELL_RATIO = 0.85  # cells per side of the second companion run, relative to the run
-SECOND_ERROR_FACTOR = 0.7  # estimated error, as a multiple of the geometric mean of both differences
+SECOND_RUN_DIFFERENCE = 0.3  # difference above which a second companion run follows, if affordable
+UNRELIABLE_DIFFERENCE = 0.4  # difference above which the error is unknown without the second one
+MAX_DIFFERENCE_RATIO = 8.0  # largest meaningful difference of the first companion run, relative to the second's
+# Estimated error, as a multiple of the geometric mean of both differences; with grips, which hold other points on every
+# mesh, as much as with one difference.
+SECOND_ERROR_FACTOR, SECOND_GRIP_ERROR_FACTOR = 0.8, 1.2
 MAX_DIFFERENCE = 1.0  # largest meaningful difference from the last companion run
 MIN_RADIUS_CELLS = 0.8  # smallest meaningful radius of a tool, in cells of the run
 
@@ -163,19 +167,22 @@ class MeshCompanion:
         coarse: plan of the first companion run, from `mesh_companion_plan` or with SECOND_CELL_RATIO.
         device: device to run on.
         cores: number of CPU cores for stepping; None for all.
+        step_ratio: with contact, number of steps relative to the run.
 
     Raises:
         DeviceError: when the device cannot run them in f64.
     """
 
-    def __init__(self, plan: Plan, coarse: Plan, device: Device, cores: int | None = None) -> None:
+    def __init__(
+        self, plan: Plan, coarse: Plan, device: Device, cores: int | None = None, step_ratio: float = 0.5
+    ) -> None:
         self._material, steps = plan.material, plan.grid.steps_per_frame
         coarsest = None if plan.has_contact else coarser_plan(coarse)
         plans = [coarse] if coarsest is None else [coarse, coarsest]
         self._solvers = []
         for companion in plans:
             # With contact, steps are limited in length, because a tool must not move too far in a step.
-            min_steps = math.ceil(plan.grid.steps_per_frame / 2) if plan.has_contact else 1
+            min_steps = math.ceil(plan.grid.steps_per_frame * step_ratio) if plan.has_contact else 1
             steps = 1 if plan.scene.time.at_rest else max(math.ceil(steps / 2), min_stable_steps(companion), min_steps)
             in_f64 = companion.with_grid(precision="f64", steps_per_frame=steps)
             self._solvers.append(build_solver(in_f64, device, cores=cores))
@@ -184,10 +191,13 @@ class MeshCompanion:
         self._ratio = min((count - 1) / (fewer - 1) for count, fewer in points)
         self._differences = [0.0 for _ in plans]
         self._sampling_error = _sampling_force_error(plan.scene)
-        self._contact = plan.has_contact
-        self._overlap = overlap(plan.tools, plan.scene.time.duration) is not None
+        self._contact, self._grips = plan.has_contact, any(tool.grips for tool in plan.tools)
         cell = max(spacing(plan.scene.sheet))
-        self._narrow = any(tool.radius < MIN_RADIUS_CELLS * cell for tool in touching_tools(plan.tools))
+        tools = [tool for tool in touching_tools(plan.tools) if tool.radius < MIN_RADIUS_CELLS * cell]
+        narrow = any(reaches_sheet(tool, plan.scene) for tool in tools)
+        overlaps = overlap(plan.tools, plan.scene.time.duration) is not None
+        # Reason for an unknown error that does not depend on the companion runs.
+        self._unknown = NARROW_TIP if narrow else OVERLAP if overlaps else ""
         self._largest, self._shortest_spring = 0.0, 1.0
         self._second_run: MeshCompanion | None = None
 
@@ -205,6 +215,8 @@ class MeshCompanion:
         self._largest = max(self._largest, max_norm(displacement))
         finer = displacement
         for n, solver in enumerate(self._solvers):
+            if self._differences[n] == math.inf:
+                return
             try:
                 solver.advance(solver.plan.grid.steps_per_frame, pause)
             except DivergedError:  # Without an equilibrium the error is unknown.
@@ -229,9 +241,10 @@ class MeshCompanion:
             device: device to run on.
             cores: number of CPU cores for stepping; None for all.
         """
-        if self._contact and not self._narrow and self._relative_difference > SECOND_RUN_DIFFERENCE:
+        if self._contact and not self._unknown and self._relative_difference > SECOND_RUN_DIFFERENCE:
             coarse = coarser_plan(plan, SECOND_CELL_RATIO)
-            self._second_run = None if coarse is None else MeshCompanion(plan, coarse, device, cores)
+            if coarse is not None:
+                self._second_run = MeshCompanion(plan, coarse, device, cores, SECOND_CELL_RATIO)
         return self._second_run
 
     @property
@@ -245,7 +258,7 @@ class MeshCompanion:
         if self._largest == 0:
             return MeshEstimate(math.inf, NO_CONTACT) if self._contact else MeshEstimate(0.0)
         first, *others = self._differences
-        if not first / self._largest < math.inf:
+        if not first / self._largest < math.inf and self._second_run is None:
             return MeshEstimate(math.inf, "the run with fewer points diverged")
         if self._contact:
             return self._contact_estimate(first / self._largest)
@@ -269,15 +282,17 @@ class MeshCompanion:
 
     def _contact_estimate(self, difference: float) -> MeshEstimate:
         """Estimate the error from the relative difference of the first companion run."""
-        if self._narrow:
-            return MeshEstimate(math.inf, NARROW_TIP)
+        if self._unknown:
+            return MeshEstimate(math.inf, self._unknown)
         error = CONTACT_ERROR_FACTOR * difference
         if difference > SECOND_RUN_DIFFERENCE:
-            if self._second_run is None or not self._second_run._relative_difference <= MAX_DIFFERENCE:
+            second = math.inf if self._second_run is None else self._second_run._relative_difference
+            factor = SECOND_GRIP_ERROR_FACTOR if self._grips else SECOND_ERROR_FACTOR
+            if second <= MAX_DIFFERENCE:
+                error = factor * math.sqrt(min(difference, MAX_DIFFERENCE_RATIO * second) * second)
+            elif self._second_run is not None or difference > UNRELIABLE_DIFFERENCE:
                 return MeshEstimate(math.inf, NOT_CONVERGED)
-            error = SECOND_ERROR_FACTOR * math.sqrt(difference * self._second_run._relative_difference)
-        doubt = OVERLAP if self._overlap else WRINKLING if self._may_wrinkle else ""
-        return MeshEstimate(error + self._sampling_error, doubt, at_most=True)
+        return MeshEstimate(error + self._sampling_error, WRINKLING if self._may_wrinkle else "", at_most=True)
 
 
 def with_points(scene: Scene, points: tuple[int, int]) -> Scene:
@@ -331,10 +346,12 @@ def choose_points(
         if needed > max_refinement:
             break
         refinement *= min(MAX_CELL_REFINEMENT, max(1.1, needed / refinement))
+    reached = f"sheet.tolerance: {tolerance:g} is out of reach: with {rows} x {cols} points the error is "
+    if estimate.error == math.inf:
+        raise SceneError([f"{reached}not known: {estimate.doubt}; change the paths, or leave out sheet.tolerance"])
     raise SceneError(
         [
-            f"sheet.tolerance: {tolerance:g} is out of reach: with {rows} x {cols} points the error is "
-            f"{estimate.error:.2g}, and no sheet has more than {MAX_POINTS} points a side; take a wider tool "
+            f"{reached}{estimate.error:.2g}, and no sheet has more than {MAX_POINTS} points a side; take a wider tool "
             "(probes.N.radius, a smaller falloff), tissue.pretension or bending where it wrinkles and every side is "
             "fixed, or a larger tolerance"
         ]

@@ -11,6 +11,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from taichi_msm.accuracy.buckling import buckling_warnings
 from taichi_msm.accuracy.companions import NEGLIGIBLE_ERROR, QUASISTATIC_REASON, CompanionRuns
 from taichi_msm.accuracy.contact_warnings import tool_contact_warnings
 from taichi_msm.accuracy.divergence import energy_growth_warnings
@@ -29,8 +30,9 @@ from taichi_msm.accuracy.time_step import TimeStepCompanion, TimeStepEstimate, c
 from taichi_msm.errors import Pause, ProgressCallback
 from taichi_msm.model import tool_force
 from taichi_msm.model.plan import Plan
+from taichi_msm.model.sheet import spacing
 from taichi_msm.model.tool_force import ProbeRecord
-from taichi_msm.model.tools import COARSE_TIP_PHRASE, MAX_POINTS_RATIO, Clamp, path_warnings
+from taichi_msm.model.tools import COARSE_TIP_PHRASE, MAX_POINTS_RATIO, path_warnings, reaches_sheet, touching_tools
 from taichi_msm.scene.section import MAX_POINTS
 from taichi_msm.scene.sheet import Foundation
 from taichi_msm.solver.dynamics import Dynamics
@@ -43,9 +45,13 @@ from taichi_msm.system.runtime import Device
 FORCE_ERROR_FACTOR = 1.15
 
 # Smallest relative error of a tool's force, as a multiple of the mesh error of the displacement, because the forces of
-# both runs may be equal by chance in a grip. The largest one, with contact, is the error of the displacement
+# both runs may be equal by chance. The largest one, with contact, is the error of the displacement
 # (docs/decisions/0027).
-MIN_FORCE_ERROR_FACTOR = 0.5
+MIN_FORCE_ERROR_FACTOR = 0.4
+
+# Smallest relative error of the force of a grip, as a multiple of the cell's side over the radius of the tool: the edge
+# of the held points is uncertain by a part of a cell, and in a pull along the sheet the displacement far more.
+GRIP_FORCE_ERROR_FACTOR = 0.15
 
 # Smallest ratio of a spring's length to its rest length for which the stability limit holds, see
 # `SpringTerm.stiffness_bound`.
@@ -141,7 +147,7 @@ class RunErrorEstimator:
         fine_steps, fine, second_mesh = self._companions.subsequent_steps, None, None
         if first is not None and fine_steps and first.estimate.error >= NEGLIGIBLE_ERROR:
             fine = TimeStepCompanion(self._plan, fine_steps, self._device, self._cores)
-        if self._mesh is not None:
+        if self._mesh is not None and self._companions.second_mesh:
             second_mesh = self._mesh.build_second_run(self._plan, self._device, self._cores)
         companions = [companion for companion in (fine, second_mesh) if companion is not None]
         if not companions:
@@ -172,8 +178,9 @@ class RunErrorEstimator:
             known = known._replace(time_step=estimate)
         if self._mesh is not None:
             known = known._replace(mesh=self._mesh.estimate)
-            in_contact = self._max_force[[not isinstance(tool, Clamp) for tool in self._plan.tools]].all()
-            if not in_contact:
+            idle = [tool for tool, force in zip(self._plan.tools, self._max_force, strict=True) if not force]
+            # A tool that passes between the mass points, and not one that stays clear of the sheet.
+            if any(reaches_sheet(tool, self._plan.scene) for tool in touching_tools(idle)):
                 known = known._replace(mesh=MeshEstimate(math.inf, NO_CONTACT))
             elif self._plan.has_contact and known.time_step is not None and known.time_step.error > MAX_DIFFERENCE:
                 known = known._replace(mesh=MeshEstimate(math.inf, LARGE_STEP_ERROR))
@@ -192,7 +199,10 @@ class RunErrorEstimator:
         relative = float(root_mean_square / self._max_force.max())
         if relative > FORCE_ERROR_FACTOR * MAX_DIFFERENCE:
             return ForceEstimate(None, NOT_CONVERGED)
-        relative = max(relative, MIN_FORCE_ERROR_FACTOR * mesh.error)
+        smallest = MIN_FORCE_ERROR_FACTOR * mesh.error
+        if radii := [tool.radius for tool in self._plan.tools if tool.grips]:
+            smallest = min(smallest, GRIP_FORCE_ERROR_FACTOR * max(spacing(self._plan.scene.sheet)) / min(radii))
+        relative = max(relative, smallest)
         if not self._plan.has_contact:
             return ForceEstimate(relative)
         displacement_error = max(mesh.error, known.time_step.error if known.time_step is not None else 0.0)
@@ -243,6 +253,7 @@ def run_warnings(
     tool_warnings = list(path_warnings(scene, plan.tools))
     yield from tool_warnings
     yield from tool_contact_warnings(plan, progress)
+    yield from buckling_warnings(plan, progress)
     yield from energy_growth_warnings(plan, progress)
     if mesh is not None and mesh.doubt and mesh.error < math.inf:
         yield f"the mesh error may be larger: {mesh.doubt}"
@@ -322,7 +333,9 @@ def _digits(number: float, digits: int = 1) -> str:
 def _mesh_remedy(plan: Plan, mesh: MeshEstimate, affords: Callable[[Plan], bool]) -> str:
     """Suggest a remedy for the mesh error: a finer mesh with at most `MAX_POINTS_RATIO` times the mass points."""
     if mesh.doubt == WRINKLING:
-        return "set tissue.bending or tissue.pretension; without them, a finer mesh has finer wrinkles"
+        return (
+            "hold every side and set tissue.bending or tissue.pretension; without them, a finer mesh has finer wrinkles"
+        )
     refinement = min(math.sqrt(mesh.error / (REMEDY_THRESHOLD / 2)), math.sqrt(MAX_POINTS_RATIO))
     rows, cols = (math.ceil((count - 1) * refinement) + 1 for count in plan.scene.sheet.points)
     if max(rows, cols) < MAX_POINTS and affords(plan_variant(plan, with_points(plan.scene, (rows, cols)))):

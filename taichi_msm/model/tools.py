@@ -381,12 +381,24 @@ def _axis_distance(a: Tool, b: Tool, offset: Array) -> Array:
     return distance
 
 
-def gap_to_sheet(tool: Tool, sheet: Sheet) -> float:
-    """Return the distance of a tool at 0 s from the sheet at rest [m], negative inside the sheet.
+def gap_to_sheet(tool: Tool, sheet: Sheet, time: float = 0.0) -> float:
+    """Return the distance of a tool at a time from the sheet at rest [m], negative inside the sheet.
 
     Args:
         tool: position-controlled tool with a shape.
         sheet: supplies the size.
+        time: time [s].
     """
     half = np.array([sheet.size[1] / 2, sheet.size[0] / 2, 0.0])
-    return tool.shape.gap(tool.tip_centre(np.zeros(1))[0], tool.axis, tool.length, tool.radius, half)
+    return tool.shape.gap(tool.tip_centre(np.array([time]))[0], tool.axis, tool.length, tool.radius, half)
+
+
+def reaches_sheet(tool: Tool, scene: Scene) -> bool:
+    """Return whether a tool meets the sheet at rest at any frame or keyframe.
+
+    Args:
+        tool: position-controlled tool with a shape.
+        scene: supplies the sheet and the frames.
+    """
+    times = [*np.linspace(0, scene.time.duration, scene.time.frames + 1), *tool.times]
+    return any(gap_to_sheet(tool, scene.sheet, time) < 0 for time in times if time <= scene.time.duration)

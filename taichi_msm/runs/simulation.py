@@ -37,6 +37,7 @@ from taichi_msm.render.picking import pick
 from taichi_msm.render.renderer import Array, CameraLike, Renderer, Shot
 from taichi_msm.render.texture import require_texture
 from taichi_msm.scene.scene import Scene
+from taichi_msm.scene.section import MAX_MAGNITUDE
 from taichi_msm.scene.tools import Probe
 from taichi_msm.solver.dynamics import ForceRecorder
 from taichi_msm.solver.planning import steer_plan, with_current_paths
@@ -535,6 +536,12 @@ class Simulation:
                 raise ArgumentError(
                     f"positions: {positions.dtype} of shape {positions.shape}; take numbers of shape {shape}"
                 )
+        # Beyond it, kernels overflow. The minimum is NaN if any value is.
+        if not (positions.min() >= -MAX_MAGNITUDE and positions.max() <= MAX_MAGNITUDE):
+            place = tuple(np.argwhere(~(np.abs(positions) <= MAX_MAGNITUDE))[0].tolist())
+            raise ArgumentError(
+                f"positions{list(place)}: {positions[place]:g}; take numbers of at most {MAX_MAGNITUDE:g}, in metres"
+            )
         if time is None:
             time = self.time
         elif not (is_real_array(as_array(time, "time"), ()) and math.isfinite(time)):

@@ -48,7 +48,8 @@ FORCE_TOLERANCE, PERTURBATION_TOLERANCE, STABILITY_TOLERANCE = 1e-7, 1e-3, 1e-9
 # Smaller forces count as 0 [N].
 MIN_FORCE_N = 1e-30
 
-# Largest number of evaluations per mass point along the longer side; a sheet that buckles takes up to 200.
+# Largest number of evaluations per mass point along the longer side, for a law without stiffening; a sheet that buckles
+# takes up to 200. The fictitious masses are those of the locked sheet, so the others take up to sqrt(factor) as many.
 MAX_EVALUATIONS = 2000
 
 Array = NDArray[np.float64]
@@ -221,7 +222,10 @@ class QuasiStatics(SheetSolver[Relaxation]):
         relaxation, rows, cols = self.kernel, self.layout.rows, self.layout.cols
         relaxation.stop()
         per_launch = max(1, min(64, POINT_STEPS_PER_LAUNCH // (rows * cols)))
-        max_evaluations, evaluations = MAX_EVALUATIONS * max(rows, cols), 0
+        laws = self.plan.material.stiffening, self.plan.material.virtual_stiffening
+        steepest = max(law.largest_slope if law else 1.0 for law in laws)
+        limit = math.ceil(MAX_EVALUATIONS * max(rows, cols) * math.sqrt(steepest))
+        max_evaluations, evaluations = limit, 0
         perturbed, stability_evaluations = tolerance >= PERTURBATION_TOLERANCE, math.inf
         scale = max(MIN_FORCE_N, relaxation.scale(row))
         while True:
@@ -235,8 +239,9 @@ class QuasiStatics(SheetSolver[Relaxation]):
             if force <= min(target, tolerance * scale):
                 converged = tolerance == FORCE_TOLERANCE
                 if converged and not is_first and evaluations < stability_evaluations and self._may_be_unstable():
-                    # An instability shows within these evaluations.
-                    tolerance, stability_evaluations = STABILITY_TOLERANCE, 4 * evaluations
+                    # An instability shows within these evaluations. A buckled shape may take as many as the first.
+                    tolerance, stability_evaluations = STABILITY_TOLERANCE, min(4 * evaluations, limit)
+                    max_evaluations = 2 * limit
                     continue
                 self.evaluations += evaluations
                 return force / scale

@@ -75,6 +75,9 @@ INVALID_ARGUMENTS: dict[str, tuple[Callable[[Simulation, Any], object], list[Any
         [
             *(np.zeros(shape) for shape in [(9, 11), (9, 12, 3), (0,)]),
             *(np.full((9, 11, 3), "a"), [[1], [1, 2]]),
+            # Their cells would cover every pixel, for a minute; NaN is found in any place.
+            *(np.full((9, 11, 3), value) for value in (np.nan, -np.inf, 1e300)),
+            np.where(np.arange(297).reshape(9, 11, 3) == 100, np.nan, 0.0),
         ],
     ),
     "texture": (

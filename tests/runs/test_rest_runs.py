@@ -109,7 +109,7 @@ def test_residual_of_a_run(device: Device, tmp_path: Path) -> None:
     assert (estimate["error"], record["error_estimate_reason"]) == (None, "quasistatic")
     assert estimate["mesh_error"]
     assert record["notes"][0].startswith("estimated error: mesh ")
-    assert "time step" in record["notes"][1]
+    assert "force error" in record["notes"][1]
     positions = read_run(tmp_path / "out").positions()
     assert positions.shape == (FRAMES + 1, *made.sheet.points, 3)
     assert (positions[0] - rest_positions(made.sheet))[..., 2].min() < -1e-3, "the first frame is deformed"

@@ -17,9 +17,10 @@ from taichi_msm.model.sheet import rest_positions
 from taichi_msm.model.tools import path_warnings
 from taichi_msm.runs.simulation import Simulation
 from taichi_msm.scene.scene import Scene
+from taichi_msm.solver import rest as rest_module
 from taichi_msm.solver.arrays import SheetLayout
 from taichi_msm.solver.dynamics import Dynamics
-from taichi_msm.solver.rest import FORCE_TOLERANCE, QuasiStatics
+from taichi_msm.solver.rest import FORCE_TOLERANCE, STABILITY_TOLERANCE, QuasiStatics
 from taichi_msm.system.runtime import Device
 from tests import reference
 from tests.golden import Messages
@@ -286,3 +287,21 @@ def test_divergence_of_a_held_sheet(
 def test_warning_of_a_grip_between_frames(message: Messages) -> None:
     plan = plan_of(at_rest([moved([0, 0.5, 0.5, 0.001], grip=[[0.2, 0.8], [0.9, 1.5]])]))
     message((note for note in path_warnings(plan.scene, plan.tools) if "grip" in note), "probes.0.grip from 0.2 ")
+
+
+def test_convergence_before_the_limit_of_evaluations(device: Device, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A shape within the tolerance is an equilibrium, although its stability is still being examined at the limit."""
+    plan = plan_of(at_rest([PRESSED]))
+    rest = QuasiStatics(plan, device)
+    rest.advance(1)
+    assert rest.residual <= STABILITY_TOLERANCE  # It was examined.
+    monkeypatch.setattr(rest_module, "MAX_EVALUATIONS", round(0.7 * rest.evaluations / max(plan.fixed.shape)))
+    shape_of(plan, device)
+
+
+def test_convergence_of_a_law_that_locks_steeply(device: Device) -> None:
+    """With the fictitious masses of a strip 900 times as stiff, FIRE takes up to 30 times the evaluations."""
+    pull = {"total": [-0.116, -0.231, 0.022], "radius": 0.004, "falloff": 430, "at": [0.68, 0.35]}
+    strip = {"points": [17, 5], "size": [0.054, 0.0135], "fixed": ["left"]}
+    stiffening = {"lock": 0.026, "factor": 900}
+    shape_of(plan_of(tissue(pull, strip, young=4e5, thickness=4e-3, foundation=3e4, stiffening=stiffening)), device)
