@@ -209,8 +209,8 @@ def energy_growth_warnings(plan: Plan, progress: RunProgress) -> Iterator[str]:
     """Yield a warning if the energy grew after the last load, beyond its oscillation with this time step.
 
     The energy is measured from the position x_n and the velocity half a step before. For a mode of frequency w it is
-    between 1 - w h / 2 and 1 + w h / 2 times the energy that Verlet's method conserves, where w h / 2 is at most r = h
-    / h_stable. Hence a factor above (1 + r) / (1 - r) between two energies is growth.
+    between 1 - w h / 2 and 1 + w h / 2 times the energy that Verlet's method conserves, where w h / 2 is at most
+    r = h / h_stable. Hence a factor above (1 + r) / (1 - r) between two energies is growth.
 
     Source: Hairer, Lubich and Wanner 2003, Acta Numerica 12, 399-450, on the conserved energy.
     """

@@ -154,9 +154,9 @@ def _sampling_force_error(scene: Scene) -> float:
 class MeshCompanion:
     """Companion runs in f64 on coarser meshes, compared with a run frame by frame.
 
-    The first one has the plan of `mesh_companion_plan`, or SECOND_CELL_RATIO. Without position-controlled
-    tools, a second one has half of its cells per side. With contact, `step_ratio` is the number of steps relative to
-    the run. A device without f64 raises a DeviceError.
+    The first one has the plan of `mesh_companion_plan`, or SECOND_CELL_RATIO. Without position-controlled tools, a
+    second one has half of its cells per side. With contact, `step_ratio` is the number of steps relative to the run. A
+    device without f64 raises a DeviceError.
     """
 
     def __init__(

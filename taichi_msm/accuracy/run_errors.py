@@ -149,7 +149,6 @@ class RunErrorEstimator:
             self._known = self._known._replace(time_step=combine_estimates(first.estimate, fine.estimate))
 
     def _repeated(self) -> Iterator[NDArray[Any]]:
-        """Repeat the run and yield the displacements of its frames."""
         dynamics = Dynamics(self._plan, self._device, cores=self._cores)
         for _ in range(self._plan.grid.frames):
             dynamics.advance(self._plan.grid.steps_per_frame)
@@ -328,7 +327,6 @@ def _mesh_remedy(plan: Plan, mesh: MeshEstimate, affords: Callable[[Plan], bool]
 
 
 def _step_remedy(plan: Plan, estimate: TimeStepEstimate, affords: Callable[[Plan], bool]) -> str:
-    """Suggest a remedy for the error of the time step and of rounding."""
     remedies = []
     if estimate.rounding > REMEDY_THRESHOLD / 2:
         remedies.append("time.precision: f64")

@@ -167,7 +167,6 @@ def _read_problem(
 
 
 def _fit(runs: Runs, scene: Scene, method: Method) -> FitResult:
-    """Estimate parameters by least squares, with their uncertainty."""
     parameters, observations = runs.problem.parameters, runs.problem.observations
     error_correlation = ErrorCorrelation(method.get("correlation"), method.get("drift"))
     start = np.zeros(len(parameters))

@@ -180,7 +180,6 @@ class Search:
         return solution
 
     def _minimise(self, start: Array, scales: Scales) -> Solution:
-        """Minimise from a start with given standard deviations."""
         from scipy.optimize import least_squares
 
         def residuals(x: Array) -> Array:

@@ -168,7 +168,6 @@ def _is_coordinate(path: Key) -> bool:
 
 
 def _default_range(scene: Scene, path: Key) -> float:
-    """Return the default range of a coordinate."""
     time, last = scene.time.duration, path[-1]
     if path[0] == "render":
         if last in ("cx", "cy"):

@@ -126,7 +126,6 @@ def _plot_match(axes: Axes, observed: PointObservation, fitted: Array) -> None:
 
 
 def _plot_residuals(axes: Axes, observed: PointObservation, fitted: Array, sheet: Sheet) -> None:
-    """Plot the residual of every point on the sheet."""
     scale, unit = _plotted_unit(observed)
     residuals = scale * np.sqrt(np.nanmean((fitted - observed.values) ** 2, axis=(1, 2)))
     across, down = observed.coordinates.T
@@ -138,7 +137,6 @@ def _plot_residuals(axes: Axes, observed: PointObservation, fitted: Array, sheet
 
 
 def _plot_forces(axes: Axes, observed: ToolForces, fitted: Array) -> None:
-    """Plot the force of every tool over time."""
     for probe in np.unique(observed.probe):
         rows = np.flatnonzero(observed.probe == probe)
         rows = rows[np.argsort(observed.time[rows])]
@@ -187,7 +185,6 @@ def _plot_test_residual(axes: Axes, fitted: FittedTest) -> None:
 
 
 def _plot_parameter(axes: Axes, result: FitResult, key: str) -> None:
-    """Plot the profile of a parameter and its interval."""
     estimate, (x, deviations) = result.parameters[key], np.array(result.curves[key]).T
     axes.plot(x, deviations**2, ".-", color=BLUE)
     axes.axvline(estimate.value, color=GREY, linewidth=0.8)

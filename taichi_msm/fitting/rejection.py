@@ -54,9 +54,9 @@ def by_pattern(
 ) -> str | None:
     """Return the reason for rejection by the pattern of the residuals, predicted minus observed values, or None.
 
-    Residuals, NaN where not observed, and predicted displacements from rest have shape (N, T, 3 or 2), times [s] (T,),
-    coordinates on the sheet (N, 2); `motion` is the root mean square of the observed motion. All are in m, or in px.
-    The remedy is for correlated errors of neighbouring points.
+    Residuals, NaN where not observed, and predicted displacements from rest have shape (N, T, 3 or 2); they are in m or
+    px, as is `motion`, the root mean square of the observed motion. Times [s] have shape (T,), coordinates on the sheet
+    (N, 2). The remedy is for correlated errors of neighbouring points.
     """
     if np.sqrt(np.nanmean(residuals**2)) < MIN_SHARE * motion:
         return None

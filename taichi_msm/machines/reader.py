@@ -224,7 +224,6 @@ def _is_header(row: Row, chosen: dict[str, str]) -> bool:
 
 
 def _find_candidates(row: Row, chosen: dict[str, str]) -> dict[str, list[int]]:
-    """Return the candidate columns of every quantity."""
     candidates = {}
     for quantity, title in chosen.items():
         # Columns of the whole title, or else of its name without the unit.
@@ -283,7 +282,6 @@ def _split_choice(title: str, quantity: str) -> tuple[str, float | None]:
 
 
 def _read_block(grid: Grid, block: _Block, chosen: dict[str, str]) -> MachineTest:
-    """Read the numbers of a block."""
     columns, notes = _select_columns(grid, block, chosen)
     rows = list(_rows_of_numbers(grid, block, columns))
     if len(rows) < MIN_ROWS:

@@ -138,7 +138,7 @@ def begin_sweep(sweep: Sweep, directory: Path, shard: tuple[int, int] = (1, 1)) 
 def read_outcome(task: RunTask, sweep: Sweep) -> Outcome | None:
     """Read the outcome of a finished run.
 
-    Return None if the record is missing, damaged, of an interrupted run or of another task, by overrides or files.
+    Return None if the record is missing, damaged, of an interrupted run, or of other overrides or files.
     """
     # A run with a damaged record is repeated.
     with suppress(OSError, ValueError, KeyError, TypeError, AttributeError, RecursionError):
@@ -237,7 +237,7 @@ class RunTask(NamedTuple):
 def execute_run(task: RunTask, progress: StageProgressCallback = lambda stage, done, total: None) -> Outcome:
     """Run a scene with its overrides on one thread, as `run --set` does; return the outcome, also of a failed run.
 
-    Only `progress` may raise, a KeyboardInterrupt, as in `runs.run.run`.
+    Nothing is raised but exceptions of `progress`, which may be KeyboardInterrupt, as in `runs.run.run`.
     """
     os.chdir(task.home)
     status: Status
@@ -256,7 +256,6 @@ def execute_run(task: RunTask, progress: StageProgressCallback = lambda stage, d
 
 
 def _run_scene(task: RunTask, progress: StageProgressCallback) -> Mapping[str, Any]:
-    """Run the scene of a task; return the record."""
     plan = plan_file(task.scene, task.overrides)
     try:
         cost.require_disk(plan, task.directory)

@@ -185,7 +185,6 @@ class Sweep:
         return [list(values) for values in zip(*columns, strict=True)]
 
     def _combination(self, run: int) -> list[Any]:
-        """Return the values of a run on the grids."""
         values = []
         for distribution in reversed(self.settings.distributions.values()):
             run, index = divmod(run, len(distribution.values))

@@ -128,7 +128,6 @@ def write_parquet(state: SweepState, written: list[str]) -> list[str]:
 
 
 def _columns(state: SweepState) -> dict[str, list[Any]]:
-    """Return the columns of the table by name."""
     values = map(list, zip(*state.values, strict=True))
     runs = [outcome.run for outcome in state.outcomes]
     return {"run": runs, **dict(zip(state.sweep.keys, values, strict=True)), **state.columns()}
@@ -205,7 +204,7 @@ def _json(value: Any) -> bytes:
 
 
 def cost_line(runs: int, expected: SweepCost, workers: WorkerCount | None) -> str:
-    """Return the estimated cost of runs as text; None instead of workers for a cluster."""
+    """Return the estimated cost of runs as text; `workers` is None for a cluster."""
     location = "if they were run here"
     if workers is not None:
         processes = f"{workers.number} {'process' if workers.number == 1 else 'processes'}"
