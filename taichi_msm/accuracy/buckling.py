@@ -19,12 +19,7 @@ REMEDY = (
 
 
 def buckling_warnings(plan: Plan, progress: RunProgress) -> Iterator[str]:
-    """Yield a warning if a sheet has buckled to an arbitrary side, or stays flat without being stable.
-
-    Args:
-        plan: plan of the run.
-        progress: progress of the run.
-    """
+    """Yield a warning if a sheet has buckled to an arbitrary side, or stays flat without being stable."""
     if not _is_symmetric(plan):
         return
     rise, largest, material = max(progress.deepest, progress.highest), progress.max_displacement, plan.material

@@ -54,9 +54,7 @@ class CompanionRuns(NamedTuple):
 def choose_companion_runs(plan: Plan, *, requested: bool = False) -> CompanionRuns:
     """Return the companion runs of a run and their cost, or the reason for a missing estimate.
 
-    Args:
-        plan: plan of the run.
-        requested: whether the user requests an error estimate at any cost.
+    `requested` chooses an error estimate at any cost.
     """
     if plan.scene.time.at_rest:
         mesh = plan.scene.tissue is not None and (requested or affords_companions(plan, MESH_COST))

@@ -16,12 +16,7 @@ from taichi_msm.solver.state import RunProgress
 
 
 def tool_contact_warnings(plan: Plan, progress: RunProgress) -> Iterator[str]:
-    """Yield warnings of tools that slide through a soft sheet, and of the first tool that pierced the sheet.
-
-    Args:
-        plan: plan of the run.
-        progress: progress of the run, with the first piercing tool.
-    """
+    """Yield warnings of tools that slide through a soft sheet, and of the first tool that pierced the sheet."""
     membrane, foundation = _stiffnesses(plan)
     remedy = "take friction: rough, " if plan.scene.time.at_rest else ""
     for tool in (tool for tool in touching_tools(plan.tools) if not tool.rough):
@@ -48,10 +43,7 @@ def tool_contact_warnings(plan: Plan, progress: RunProgress) -> Iterator[str]:
 def first_piercing_probe(plan: Plan, displacement: NDArray[np.floating], frame: int) -> int:
     """Return the index, plus 1, of the first probe whose axis passes through the sheet; 0 if none does.
 
-    Args:
-        plan: plan of the run.
-        displacement: displacements of the mass points [m], shape (rows, cols, 3).
-        frame: number of their frame.
+    `displacement` is that of the mass points in a frame [m], shape (rows, cols, 3).
     """
     if not plan.has_contact:
         return 0

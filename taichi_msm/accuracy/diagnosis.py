@@ -23,24 +23,16 @@ from taichi_msm.solver.state import RunProgress, Snapshot, largest_displacement
 
 @dataclass(frozen=True)
 class Diagnosis:
-    """The cause of a divergence, and the last state before it.
+    """The cause of a divergence, and the last state before it."""
 
-    Attributes:
-        message: time, step, mass point, likely cause and remedy.
-        last_sound_state: last state of the run without a fault; None for the state of rest.
-    """
-
-    message: str
-    last_sound_state: Snapshot | None
+    message: str  # time, step, mass point, likely cause and remedy
+    last_sound_state: Snapshot | None  # last state of the run without a fault; None for the state of rest
 
 
 def diagnose(dynamics: SheetSolver[Any], start: Snapshot | None, pause: Pause) -> Diagnosis:
     """Return the step, the mass point and the likely cause of a divergence within the current frame.
 
-    Args:
-        dynamics: solver that diverged; its state afterwards is arbitrary.
-        start: sound state from which the run is repeated; None for the state of rest.
-        pause: called several times a second; an exception from it ends the diagnosis.
+    The run is repeated from the sound state `start`, None for rest; the state of the solver is arbitrary afterwards.
     """
     plan, grid, bad_step = dynamics.plan, dynamics.plan.grid, dynamics.steps_done
     recorder = ForceRecorder(plan)

@@ -26,13 +26,8 @@ def displacement_bound(
 ) -> float:
     """Return the largest displacement of a mass point in a sound run [m]; infinite if a foundation can accelerate it.
 
-    Args:
-        plan: plan of the run.
-        time: time since the start of the run [s].
-        acceleration: bound of the acceleration of a free mass point by the probes so far [m/s^2]; by default that of
-            the scene's probes.
-        tool_energy: bound of the energy supplied by position-controlled tools so far [J]; by default that of the
-            scene's tools.
+    `time` [s] is since the start. By default, the bounds of the acceleration of a free mass point [m/s^2], and of the
+    energy supplied by position-controlled tools so far [J], are those of the scene.
     """
     # Deformation moves a mass point by at most ten sizes of the sheet; a tool moves the tissue that it holds along its
     # path.
@@ -67,17 +62,10 @@ class DivergenceMonitor:
 
     A growth of the energy after the last load shows steps that are too long for compressed springs, see
     `energy_growth_warnings`.
-
-    Args:
-        plan: plan of the run.
-        progress: progress at the frame from which the run continues; None for the start.
-
-    Attributes:
-        progress: progress at the last frame without a fault, initially at the first frame.
     """
 
     def __init__(self, plan: Plan, progress: RunProgress | None = None) -> None:
-        self.progress = progress or RunProgress()
+        self.progress = progress or RunProgress()  # at the last frame without a fault, initially at the first one
         self._grid, material = plan.grid, plan.material
         self._acceleration = self._tool_energy = 0.0
         self._load_norms = np.array([decay_norm_bound(slot, plan) for slot in plan.slots])
@@ -184,14 +172,7 @@ class DivergenceMonitor:
 
 
 def format_message(time: float, step: int, fault: str, *, exact: bool) -> str:
-    """Return the message about a divergence.
-
-    Args:
-        time: time of the divergence [s].
-        step: number of the step.
-        fault: fault reported by `DivergenceMonitor`.
-        exact: whether the previous step is known to have no fault.
-    """
+    """Return the message about a divergence; `exact`: whether the previous step is known to have no fault."""
     return f"diverged {'at' if exact else 'before'} {time:.6g} s, step {step}: {fault}"
 
 
@@ -230,10 +211,6 @@ def energy_growth_warnings(plan: Plan, progress: RunProgress) -> Iterator[str]:
     The energy is measured from the position x_n and the velocity half a step before. For a mode of frequency w it is
     between 1 - w h / 2 and 1 + w h / 2 times the energy that Verlet's method conserves, where w h / 2 is at most
     r = h / h_stable. Hence a factor above (1 + r) / (1 - r) between two energies is growth.
-
-    Args:
-        plan: plan of the run.
-        progress: progress of the run, with the growth of the energy.
 
     Source: Hairer, Lubich and Wanner 2003, Acta Numerica 12, 399-450, on the conserved energy.
     """

@@ -93,14 +93,9 @@ class MeshEstimate:
 
 
 def coarser_plan(plan: Plan, ratio: float = 0.5) -> Plan | None:
-    """Plan the scene on a coarser mesh with the same total forces.
+    """Plan the scene on a mesh with a ratio of the cells per side, and with the same total forces.
 
-    Args:
-        plan: plan of the scene.
-        ratio: number of cells per side, relative to the plan.
-
-    Returns:
-        The plan; None without tissue, with too few mass points, or with cells beyond the largest aspect ratio.
+    Return None without tissue, with too few mass points, or with cells beyond the largest aspect ratio.
     """
     scene = plan.scene
     if scene.tissue is None or min(scene.sheet.points) < MIN_POINTS_PER_SIDE:
@@ -159,18 +154,9 @@ def _sampling_force_error(scene: Scene) -> float:
 class MeshCompanion:
     """Companion runs in f64 on coarser meshes, compared with a run frame by frame.
 
-    The first one has the plan of `mesh_companion_plan`. Without position-controlled tools, a second one has half of its
-    cells per side.
-
-    Args:
-        plan: plan of the compared run.
-        coarse: plan of the first companion run, from `mesh_companion_plan` or with SECOND_CELL_RATIO.
-        device: device to run on.
-        cores: number of CPU cores for stepping; None for all.
-        step_ratio: with contact, number of steps relative to the run.
-
-    Raises:
-        DeviceError: when the device cannot run them in f64.
+    The first one has the plan of `mesh_companion_plan`, or SECOND_CELL_RATIO. Without position-controlled tools, a
+    second one has half of its cells per side. With contact, `step_ratio` is the number of steps relative to the run. A
+    device without f64 raises a DeviceError.
     """
 
     def __init__(
@@ -206,11 +192,9 @@ class MeshCompanion:
         self._solvers[0].compile()
 
     def compare_frame(self, displacement: NDArray[Any], pause: Pause) -> None:
-        """Step to the next frame and compare it.
+        """Step to the next frame and compare it with the displacements of the run [m], shape (rows, cols, 3).
 
-        Args:
-            displacement: displacements of the run at that frame [m], shape (rows, cols, 3).
-            pause: called several times a second; after an exception from it the companion runs cannot continue.
+        After an exception from `pause`, the companion runs cannot continue.
         """
         self._largest = max(self._largest, max_norm(displacement))
         finer = displacement
@@ -234,13 +218,7 @@ class MeshCompanion:
         return self._solvers[0].tool_forces()
 
     def build_second_run(self, plan: Plan, device: Device, cores: int | None = None) -> MeshCompanion | None:
-        """Return the second companion run, which begins at the first frame; None if the first one suffices.
-
-        Args:
-            plan: plan of the run.
-            device: device to run on.
-            cores: number of CPU cores for stepping; None for all.
-        """
+        """Return the second companion run, which begins at the first frame; None if the first one suffices."""
         if self._contact and not self._unknown and self._relative_difference > SECOND_RUN_DIFFERENCE:
             coarse = coarser_plan(plan, SECOND_CELL_RATIO)
             if coarse is not None:
@@ -296,12 +274,7 @@ class MeshCompanion:
 
 
 def with_points(scene: Scene, points: tuple[int, int]) -> Scene:
-    """Return a copy of a scene with another mesh and without `sheet.tolerance`.
-
-    Args:
-        scene: scene to copy.
-        points: numbers of rows and columns of mass points.
-    """
+    """Return a copy of a scene with another mesh, (rows, cols), and without `sheet.tolerance`."""
     return scene.model_copy(update={"sheet": scene.sheet.model_copy(update={"points": points, "tolerance": None})})
 
 
@@ -313,16 +286,9 @@ def choose_points(
 ) -> tuple[Plan, MeshEstimate]:
     """Return a plan with about the coarsest mesh whose error is within the sheet's tolerance, and the estimated error.
 
-    The search begins with the plan's mesh, and keeps the shape of the cells.
-
-    Args:
-        plan: plan of a scene with a tolerance of the sheet.
-        device: device for the trial runs.
-        check: function that validates a scene with given maps and builds its plan.
-        progress: called with the number of finished frames of each trial run and their total.
-
-    Raises:
-        SceneError: when no mesh within the limits meets the tolerance, or a mesh of the search is invalid.
+    The search begins with the plan's mesh, and keeps the shape of the cells; `check` validates a scene with given maps
+    and plans it. Raise a SceneError when no mesh within the limits meets the tolerance, or a mesh of the search is
+    invalid.
     """
     tolerance, given = plan.scene.sheet.tolerance, plan.scene.sheet.points
     assert tolerance is not None
@@ -359,13 +325,7 @@ def choose_points(
 
 
 def estimate_mesh_error(plan: Plan, device: Device, progress: ProgressCallback) -> MeshEstimate:
-    """Return the mesh error of a scene, estimated by a run and its companion runs, all in f64.
-
-    Args:
-        plan: plan of a scene with a `mesh_companion_plan`.
-        device: device to run on.
-        progress: called with the number of finished frames and their total.
-    """
+    """Return the mesh error of a scene with a `mesh_companion_plan`, by a run and its companion runs, all in f64."""
     in_f64, coarse, grid = plan.with_grid(precision="f64"), mesh_companion_plan(plan), plan.grid
     assert coarse is not None
     first = MeshCompanion(in_f64, coarse, device)
@@ -382,14 +342,9 @@ def estimate_mesh_error(plan: Plan, device: Device, progress: ProgressCallback) 
 
 
 def interpolate(displacement: NDArray[Any], target: NDArray[Any]) -> NDArray[np.float64]:
-    """Interpolate a lattice by cubics at the nodes of another lattice.
+    """Interpolate displacements [m], shape (rows, cols, 3), at least 4 x 4, by cubics at the nodes of another lattice.
 
-    Args:
-        displacement: displacements at the nodes of a lattice of at least 4 x 4 [m], shape (rows, cols, 3).
-        target: any values at the nodes of the other lattice, shape (rows, cols, 3); only the shape matters.
-
-    Returns:
-        Displacements at the nodes of the other lattice [m], of the shape of `target`.
+    The values of `target` do not matter, only its shape.
     """
     for count, target_count in zip(displacement.shape[:2], target.shape[:2], strict=True):
         first, weights = _cubic_weights(count - 1, target_count - 1)
@@ -402,9 +357,8 @@ def interpolate(displacement: NDArray[Any], target: NDArray[Any]) -> NDArray[np.
 def _cubic_weights(source: int, target: int) -> tuple[NDArray[np.intp], NDArray[np.float64]]:
     """Return the interpolation along a side from `source` to `target` cells.
 
-    Returns:
-        Index of the first of four neighbouring source nodes of every target node, shape (target + 1,), and the weights
-        of the four, shape (4, target + 1).
+    These are the index of the first of four neighbouring source nodes of every target node, shape (target + 1,), and
+    the weights of the four, shape (4, target + 1).
     """
     position = np.arange(target + 1) * (source / target)
     first = np.clip(np.floor(position).astype(int) - 1, 0, source - 3)

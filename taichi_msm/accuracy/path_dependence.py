@@ -57,12 +57,7 @@ class PathDependence:
         self._differences: list[tuple[float, int, str]] = []
 
     def check_frame(self, frame: int, displacement: Array) -> None:
-        """Check the next frame for a jump, and keep the frames for second solutions.
-
-        Args:
-            frame: number of the frame.
-            displacement: displacements of the mass points [m], shape (rows, cols, 3).
-        """
+        """Check the next frame for a jump, and keep it for second solutions; `displacement` [m]: (rows, cols, 3)."""
         size, current = max_norm(displacement), (frame, displacement)
         if size > self._largest:
             self._largest, self._most_displaced, self._unloaded = size, current, None
@@ -98,13 +93,7 @@ class PathDependence:
         return affords_companions(self._plan, companion_cost + second_cost)
 
     def finish(self, device: Device, cores: int | None, pause: Pause) -> None:
-        """Solve the most displaced frame, a later half-unloaded frame and the last frame again by `second_solution`.
-
-        Args:
-            device: device to solve on.
-            cores: number of CPU cores; None for all.
-            pause: called often; an exception from it ends the solutions.
-        """
+        """Solve the most displaced frame, a later half-unloaded frame and the last frame again by `second_solution`."""
         has_history = any(term.has_history(self._plan) for term in build_terms(self._plan))
         if self._largest == 0 or has_history:
             return
@@ -133,16 +122,8 @@ class PathDependence:
 def second_solution(plan: Plan, frame: int, device: Device, cores: int | None, pause: Pause) -> Array | None:
     """Solve a frame from rest: its loads act at once, then tools move straight from their first positions.
 
-    Args:
-        plan: plan of a quasi-static scene.
-        frame: number of the frame.
-        device: device to solve on.
-        cores: number of CPU cores; None for all.
-        pause: called often; an exception from it ends the solution.
-
-    Returns:
-        Displacements [m], shape (rows, cols, 3); None without an equilibrium, or in a grip, whose equilibrium always
-        depends on the path.
+    Return displacements [m], shape (rows, cols, 3); None without an equilibrium, or in a grip, whose equilibrium always
+    depends on the path.
     """
     scene, rate = plan.scene, plan.grid.frames_per_second
     if any(frame in grip_frames(grip, rate) for tool in plan.tools for grip in tool.grips):

@@ -80,15 +80,8 @@ class RunErrorEstimates(NamedTuple):
 class RunErrorEstimator:
     """Companion runs of a run, and the errors that they estimate.
 
-    Args:
-        plan: plan of the run.
-        companions: companion runs of the run.
-        known: estimates from the searches for a step and a mesh before the run; these errors are not estimated again.
-        device: device to run on.
-        cores: number of CPU cores for stepping.
-
-    Raises:
-        DeviceError: when the device cannot run the scene in f64.
+    Errors known from the searches for a step and a mesh before the run are not estimated again. A device without f64
+    raises a DeviceError.
     """
 
     def __init__(
@@ -114,12 +107,10 @@ class RunErrorEstimator:
                 companion.compile()
 
     def compare_frame(self, displacement: NDArray[Any], pause: Pause, forces: NDArray[np.float64]) -> None:
-        """Step to the next frame and compare it.
+        """Step to the next frame and compare it with the displacements of the run [m], shape (rows, cols, 3).
 
-        Args:
-            displacement: displacements of the run at that frame [m], shape (rows, cols, 3).
-            pause: called several times a second; after an exception from it the companion runs cannot continue.
-            forces: mean forces of the position-controlled tools since the previous frame [N], shape (tools, 3).
+        The forces of the position-controlled tools [N], shape (tools, 3), are means since the previous frame. After an
+        exception from `pause`, the companion runs cannot continue.
         """
         if self._time_step is not None:
             self._time_step.compare_frame(displacement, pause)
@@ -138,10 +129,8 @@ class RunErrorEstimator:
     def finish(self, displacements: Iterator[NDArray[Any]] | None, progress: ProgressCallback) -> None:
         """Run the subsequent companion runs after the last frame, if the first ones require any.
 
-        Args:
-            displacements: displacements of the run at all frames but the first [m], each of shape (rows, cols, 3); None
-                to repeat the run.
-            progress: called with the number of finished frames and their total.
+        Displacements of the run [m], shape (rows, cols, 3), are those of all frames but the first; None to repeat the
+        run.
         """
         first = self._time_step
         fine_steps, fine, second_mesh = self._companions.subsequent_steps, None, None
@@ -160,7 +149,6 @@ class RunErrorEstimator:
             self._known = self._known._replace(time_step=combine_estimates(first.estimate, fine.estimate))
 
     def _repeated(self) -> Iterator[NDArray[Any]]:
-        """Repeat the run and yield the displacements of its frames."""
         dynamics = Dynamics(self._plan, self._device, cores=self._cores)
         for _ in range(self._plan.grid.frames):
             dynamics.advance(self._plan.grid.steps_per_frame)
@@ -219,13 +207,8 @@ def run_warnings(
 ) -> Iterator[str]:
     """Yield the error estimates and warnings of a run up to its last frame, a line of text each.
 
-    Args:
-        plan: plan of the run.
-        probes: records of the probes' forces.
-        progress: progress of the run.
-        errors: estimated errors of the run.
-        affords: function that returns whether a plan runs within an hour.
-        scale: pixels per metre at the middle of the sheet; None without a picture.
+    `affords`: whether a plan runs within an hour; `scale`: pixels per metre at the middle of the sheet, None without a
+    picture.
     """
     scene, grid = plan.scene, plan.grid
     time_step, reason, mesh, force = errors
@@ -344,7 +327,6 @@ def _mesh_remedy(plan: Plan, mesh: MeshEstimate, affords: Callable[[Plan], bool]
 
 
 def _step_remedy(plan: Plan, estimate: TimeStepEstimate, affords: Callable[[Plan], bool]) -> str:
-    """Suggest a remedy for the error of the time step and of rounding."""
     remedies = []
     if estimate.rounding > REMEDY_THRESHOLD / 2:
         remedies.append("time.precision: f64")

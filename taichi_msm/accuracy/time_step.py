@@ -72,13 +72,8 @@ def choose_step(
 ) -> tuple[Plan, TimeStepEstimate]:
     """Return a plan with the largest stable step whose error is within the scene's tolerance, and the estimated error.
 
-    Args:
-        plan: plan with a tolerance, and with the smallest number of steps per frame of the search.
-        device: device for the trial runs.
-        progress: called with the number of finished frames of each trial run and their total.
-
-    Raises:
-        SceneError: when no step meets the tolerance; suggests a precision or a tolerance.
+    The search begins with the steps per frame of the plan. Raise a SceneError, with a precision or a tolerance as
+    remedy, when no step meets the tolerance.
     """
     tolerance, steps, trials = plan.scene.time.tolerance, plan.grid.steps_per_frame, TimeStepTrials(plan, device)
     assert tolerance is not None
@@ -109,17 +104,8 @@ class TimeStepCompanion:
     rounding. A coarse companion has none. The difference of the two runs then contains the rounding, plus r^-p - 1
     times the error of the step. It is the estimate, scaled up if r^-p - 1 is smaller than `COARSE_MARGIN`.
 
-    Args:
-        plan: plan of the run.
-        steps: steps per frame of the companion run; 0 if the error cannot be estimated.
-        device: device to run on.
-        cores: number of CPU cores for stepping; None for all. The kernels of a run with the same number are reused.
-
-    Attributes:
-        displacement: displacements of the companion run at the last frame [m], shape (rows, cols, 3).
-
-    Raises:
-        DeviceError: when the device cannot run it in f64.
+    With 0 steps per frame the error cannot be estimated. The kernels of a run with the same number of cores are reused.
+    A device without f64 raises a DeviceError.
     """
 
     def __init__(self, plan: Plan, steps: int, device: Device, cores: int | None = None) -> None:
@@ -139,12 +125,7 @@ class TimeStepCompanion:
         self.restart(plan, steps)
 
     def restart(self, plan: Plan, steps: int) -> None:
-        """Restart for another run of the same scene; a fine companion run must stay fine.
-
-        Args:
-            plan: plan of the run.
-            steps: steps per frame of the companion run; 0 if the error cannot be estimated.
-        """
+        """Restart for another run of the same scene; a fine companion run must stay fine."""
         self._plan, self._steps = plan, steps
         in_f64 = plan.with_grid(precision="f64")
         if steps:
@@ -158,11 +139,9 @@ class TimeStepCompanion:
         self._dynamics.compile()
 
     def compare_frame(self, displacement: NDArray[Any], pause: Pause) -> None:
-        """Step to the next frame and compare it.
+        """Step to the next frame and compare it with the displacements of the run [m], shape (rows, cols, 3).
 
-        Args:
-            displacement: displacements of the run at that frame [m], shape (rows, cols, 3).
-            pause: called several times a second; after an exception from it the companion run cannot continue.
+        After an exception from `pause`, the companion run cannot continue.
         """
         if not self._steps:
             return
@@ -210,15 +189,7 @@ class TimeStepCompanion:
 
 
 def combine_estimates(coarse: TimeStepEstimate, fine: TimeStepEstimate) -> TimeStepEstimate:
-    """Combine the estimates of a coarse and a fine companion run.
-
-    Args:
-        coarse: estimate of the coarse companion run.
-        fine: estimate of the fine companion run.
-
-    Returns:
-        The fine estimate; with contact, scaled toward the coarse one by at most the factor 1 +- `COARSE_INFLUENCE`.
-    """
+    """Return the fine estimate; with contact, scaled toward the coarse one by at most 1 +- `COARSE_INFLUENCE`."""
     if not fine.at_most or fine.error in (0, math.inf):
         return fine
     factor = min(max(coarse.error / fine.error, 1 - COARSE_INFLUENCE), 1 + COARSE_INFLUENCE)
@@ -228,12 +199,7 @@ def combine_estimates(coarse: TimeStepEstimate, fine: TimeStepEstimate) -> TimeS
 
 
 class TimeStepTrials:
-    """Trial runs of a scene with different steps, each with a companion run.
-
-    Args:
-        plan: plan of the scene.
-        device: device for the trial runs.
-    """
+    """Trial runs of a scene with different steps, each with a companion run."""
 
     def __init__(self, plan: Plan, device: Device) -> None:
         self._plan = plan
@@ -241,12 +207,7 @@ class TimeStepTrials:
         self._dynamics = Dynamics(plan, device)
 
     def estimate(self, steps: int, progress: ProgressCallback = lambda done, total: None) -> TimeStepEstimate:
-        """Return the error with a number of steps per frame, estimated by a run.
-
-        Args:
-            steps: steps per frame.
-            progress: called with the number of finished frames and their total.
-        """
+        """Return the error with a number of steps per frame, estimated by a run."""
         plan = self._plan.with_grid(steps_per_frame=steps)
         fine, frames = fine_steps(plan), plan.grid.frames
         self._companion.restart(plan, fine)

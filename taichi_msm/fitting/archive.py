@@ -34,15 +34,7 @@ KINDS: dict[str, type[PointObservation]] = {"position": Positions, "pixel": Pixe
 
 
 def read_observations(observed: str | Path | Mapping[str, Any], rate: float) -> PointObservation:
-    """Return the observed points of a file or of a mapping.
-
-    Args:
-        observed: path of an .npz, or a mapping of array names to arrays.
-        rate: frames per second of the scene, for the times of a tracks.npz.
-
-    Raises:
-        SceneError: when arrays are missing, not supported, or have wrong shapes or values.
-    """
+    """Return the observed points of a file or mapping; `rate`: frames per second, for the times of a tracks.npz."""
     if isinstance(observed, Mapping):
         name, names = "observed", [str(key) for key in observed]
         _require_supported(name, names)

@@ -14,17 +14,11 @@ from taichi_msm.scene.scene import Scene
 from taichi_msm.scene.section import FRAME_TOLERANCE
 
 
-def faults(observations: Sequence[Observation], scene: Scene, parameters: int) -> Iterator[str]:
-    """Yield the faults found without a run: too few observations, wrong units or times, no motion.
-
-    Args:
-        observations: the observations.
-        scene: the initial scene.
-        parameters: number of parameters.
-    """
+def faults(observations: Sequence[Observation], scene: Scene, parameter_count: int) -> Iterator[str]:
+    """Yield the faults found without a run: too few observations, wrong units or times, no motion."""
     count, first = sum(int(observed.known.sum()) for observed in observations), observations[0]
-    if count <= parameters:
-        fault = f"{count} observed numbers are too few for {parameters} parameters and their errors"
+    if count <= parameter_count:
+        fault = f"{count} observed numbers are too few for {parameter_count} parameters and their errors"
         yield f"{first.name}: {fault}; observe more points or times, or free fewer keys"
         return
     for observed in observations:
@@ -41,12 +35,8 @@ def faults_at_start(
 ) -> Iterator[str]:
     """Yield the faults found with a run of the initial scene: no motion at the times, another camera or origin, signs.
 
-    Args:
-        observations: the observations.
-        scene: the initial scene.
-        initial: prediction of the initial scene, up to its last frame.
-        parameters: parameters of the fit. A free camera skips the check of the camera; a linear parameter, which may
-            change sign, skips that of signs.
+    The prediction reaches to the last frame. A free camera skips the check of the camera; a linear parameter, which may
+    change sign, skips that of signs.
     """
     rate, motion, name = scene.time.frames_per_second, float(initial.motion.max()), observations[0].name
     if motion <= ROUNDING_SHARE * max(scene.sheet.size):
@@ -74,24 +64,13 @@ def faults_at_start(
 
 
 def opposed(observations: Sequence[Observation], scene: Scene, *predictions: Prediction) -> Iterator[str]:
-    """Yield a message for every component with the opposite sign in all predictions.
-
-    Args:
-        observations: the observations.
-        scene: the initial scene.
-        predictions: predictions of all observations.
-    """
+    """Yield a message for every component with the opposite sign in all predictions."""
     for n, observed in enumerate(observations):
         yield from observed.opposed(scene, *(prediction.values[n] for prediction in predictions))
 
 
 def unit_faults(observations: Sequence[Observation], *predictions: Prediction) -> Iterator[str]:
-    """Yield a message for every observation in another unit, if all predictions agree on it.
-
-    Args:
-        observations: the observations.
-        predictions: predictions of all observations.
-    """
+    """Yield a message for every observation in another unit, if all predictions agree on it."""
     for n, observed in enumerate(observations):
         yield from observed.unit_faults(*(prediction.values[n] for prediction in predictions))
 

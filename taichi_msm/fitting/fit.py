@@ -167,7 +167,6 @@ def _read_problem(
 
 
 def _fit(runs: Runs, scene: Scene, method: Method) -> FitResult:
-    """Estimate parameters by least squares, with their uncertainty."""
     parameters, observations = runs.problem.parameters, runs.problem.observations
     error_correlation = ErrorCorrelation(method.get("correlation"), method.get("drift"))
     start = np.zeros(len(parameters))
@@ -265,13 +264,7 @@ def _fit(runs: Runs, scene: Scene, method: Method) -> FitResult:
 
 
 def search_notes(solution: Solution, parameters: Sequence[Parameter], *, fits_well: bool) -> Iterator[str]:
-    """Yield warnings about the search.
-
-    Args:
-        solution: solution found.
-        parameters: parameters of the fit.
-        fits_well: whether the residual is small.
-    """
+    """Yield warnings about the search."""
     if not solution.converged:
         yield "the search did not converge; take closer initial values by --set, or give --bounds"
     if not fits_well:
@@ -296,12 +289,7 @@ def uncertainty_notes(
 ) -> Iterator[str]:
     """Yield warnings about mesh errors beyond the intervals, and about correlated, but identified parameters.
 
-    Args:
-        parameters: parameters of the fit.
-        x: their coordinates at the solution, shape (n,).
-        uncertainties: uncertainty of the solution.
-        shifts: mesh errors in units of x, shape (n,), NaN if unknown; None if all are.
-        unidentified: groups of parameters that are not identifiable.
+    The mesh errors `shifts`, in units of x, have shape (n,), NaN if unknown; None if all are.
     """
     half_widths = uncertainties.quantile * uncertainties.deviations
     if shifts is not None and (moved := np.flatnonzero(shifts > half_widths).tolist()):

@@ -60,13 +60,7 @@ class Forces(Observation):
 
 
 class ForceModel(ObservationModel):
-    """Map from a run to the forces of its tools at the measured times.
-
-    Args:
-        scene: scene of the run.
-        observed: measured forces, with times and tools.
-        frames: number of recorded frames.
-    """
+    """Map from a run to the forces of its tools at the measured times."""
 
     def __init__(self, scene: Scene, observed: ToolForces, frames: int) -> None:
         self._probe, self._time_weights = observed.probe, observation.time_weights(scene, observed.time, frames)
@@ -116,17 +110,8 @@ class ToolForces(Forces):
         return lengths[0] / lengths[1] if is_parallel else 0.0
 
 
-def read_forces(path: str | Path, sigma: float, probes: int) -> ToolForces:
-    """Return the forces of a forces.csv.
-
-    Args:
-        path: path of the file.
-        sigma: standard deviation of the error of each component [N].
-        probes: number of tools of the scene.
-
-    Raises:
-        SceneError: when the file is no valid table, or has a tool that is not in the scene.
-    """
+def read_forces(path: str | Path, sigma: float, probe_count: int) -> ToolForces:
+    """Return the forces of a forces.csv; `sigma`: standard deviation of the error of a component [N]."""
     name = str(path)
     if not 0 < sigma < math.inf:
         raise SceneError([f"--forces {name},{sigma:g}: take a number above 0, the standard deviation in newtons"])
@@ -176,8 +161,8 @@ def read_forces(path: str | Path, sigma: float, probes: int) -> ToolForces:
         fault = "no force" if len(time) else "no row"
         raise SceneError([f"{name}: {fault}; {EXPECTED}, and rows of numbers"])
     for n, index in zip(rows, probe.tolist(), strict=True):
-        if index not in range(probes):
-            raise SceneError([f"{grid.place(n)}: probe: {index:g}; the scene has {probes}, numbered from 0"])
+        if index not in range(probe_count):
+            raise SceneError([f"{grid.place(n)}: probe: {index:g}; the scene has {probe_count}, numbered from 0"])
     _, kept = np.unique(table[:, :2], axis=0, return_index=True)
     for n in set(range(len(rows))) - set(kept.tolist()):
         raise SceneError([f"{grid.place(rows[n])}: a second row of {time[n]:g} s and probe {probe[n]:g}; leave one"])

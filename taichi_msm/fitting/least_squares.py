@@ -29,30 +29,19 @@ Scales = tuple["float | Array", ...]
 
 @dataclass(frozen=True, eq=False)
 class Solution:
-    """Solution of the least-squares problem.
+    """Solution of the least-squares problem."""
 
-    Attributes:
-        x: coordinates of the parameters, shape (n,).
-        predicted: prediction at x.
-        scales: standard deviations of the observations in the cost.
-        cost: half the sum of rho.
-        converged: whether the search has converged.
-    """
-
-    x: Array
-    predicted: Prediction
-    scales: Scales
-    cost: float
+    x: Array  # coordinates of the parameters, shape (n,)
+    predicted: Prediction  # at x
+    scales: Scales  # of the cost
+    cost: float  # half the sum of rho
     converged: bool
 
 
 class Misfit:
     """Residuals of predictions, flattened to one axis of all known values, one observation after the other.
 
-    Args:
-        observations: the observations.
-        signals: root mean square of every observation, from `Observation.signal`.
-        robust: whether outliers are downweighted.
+    `signals` are from `Observation.signal`; with `robust`, outliers are downweighted.
     """
 
     def __init__(self, observations: Sequence[Observation], signals: Sequence[float], *, robust: bool) -> None:
@@ -79,12 +68,9 @@ class Misfit:
         return sum(observed.freedom for observed in self.observations)
 
     def scaled(self, rows: Array, scales: Scales, robust_factor: Callable[[Array], Array] | None = None) -> Array:
-        """Return rows divided by standard deviations, without unknown offsets, shape (known, ...).
+        """Return rows in the units of the observations / scales, without unknown offsets, shape (known, ...).
 
-        Args:
-            rows: rows in the units of the observations, shape (known, ...).
-            scales: standard deviations of the observations.
-            robust_factor: as for `Observation.without_offset`.
+        `robust_factor` is as for `Observation.without_offset`.
         """
         deviations = np.concatenate([np.broadcast_to(scale, n) for scale, n in zip(scales, self.count, strict=True)])
         parts = self.split(rows / deviations.reshape(-1, *(1,) * (rows.ndim - 1)))
@@ -92,12 +78,7 @@ class Misfit:
         return np.concatenate([observed.without_offset(part, robust_factor) for observed, part in pairs])
 
     def residuals(self, predicted: Prediction, scales: Scales) -> Array:
-        """Return the residuals r, shape (known,).
-
-        Args:
-            predicted: prediction of all observations.
-            scales: standard deviations of the observations.
-        """
+        """Return the residuals r, shape (known,)."""
         return self.scaled(self.difference(predicted), scales, self.robust_factor if self.robust else None)
 
     def robust_factor(self, residuals: Array) -> Array:
@@ -109,16 +90,11 @@ class Misfit:
         rho = 2 * OUTLIER_SIGMAS**2 * (np.sqrt(self.robust_factor(residuals)) - 1) if self.robust else residuals**2
         return float(np.sum(rho)) / 2
 
-    def deviations(self, predicted: Prediction, parameters: int) -> list[float]:
-        """Return the standard deviation of every observation, in its unit, estimated from its residuals.
-
-        Args:
-            predicted: prediction of all observations.
-            parameters: number of parameters, for the degrees of freedom.
-        """
+    def deviations(self, predicted: Prediction, parameter_count: int) -> list[float]:
+        """Return the standard deviation of every observation, in its unit, estimated from its residuals."""
         deviations = []
         for residuals, signal in zip(self.split(self.difference(predicted)), self.signals, strict=True):
-            mean_square = np.sum(residuals**2) / max(1, len(residuals) - parameters)
+            mean_square = np.sum(residuals**2) / max(1, len(residuals) - parameter_count)
             # 1.4826 converts the median magnitude of normal errors to sigma.
             sigma = 1.4826 * np.median(np.abs(residuals)) if self.robust else np.sqrt(mean_square)
             deviations.append(max(float(sigma), 1e-9 * signal))
@@ -134,12 +110,9 @@ class Misfit:
 
 
 class Search:
-    """Nonlinear least squares with restarts.
+    """Nonlinear least squares with restarts; an unknown sigma starts at the signal.
 
-    Args:
-        runs: predictions.
-        misfit: residuals; an unknown sigma starts at the signal.
-        limits: smallest and largest coordinates, each of shape (n,); by default those of the parameters.
+    The limits of x, shape (n,) each, are by default those of the parameters.
     """
 
     def __init__(self, runs: Runs, misfit: Misfit, limits: tuple[Array, Array] | None = None) -> None:
@@ -180,12 +153,7 @@ class Search:
         return self._differences(solution.x, solution.predicted, signs=self._runs.problem.signs)
 
     def remember(self, x: Array, predicted: Prediction) -> None:
-        """Cache a prediction.
-
-        Args:
-            x: coordinates of the parameters, shape (n,).
-            predicted: prediction at x.
-        """
+        """Cache the prediction at x, shape (n,)."""
         self._known[x.tobytes()] = predicted
 
     def _predict(self, x: Array) -> Prediction | None:
@@ -212,7 +180,6 @@ class Search:
         return solution
 
     def _minimise(self, start: Array, scales: Scales) -> Solution:
-        """Minimise from a start with given standard deviations."""
         from scipy.optimize import least_squares
 
         def residuals(x: Array) -> Array:

@@ -36,9 +36,6 @@ from taichi_msm.scene.scene import Scene
 # Number of travels of a curve above 0; extension of the curve for free depths of contact [share of its reach].
 TRAVELS, CONTACT_MARGIN = 24, 0.05
 
-# Smallest half width of the trust region, in units of x.
-MIN_REGION = 1e-6
-
 # Share of every branch in the run of a curve: no relaxation, but the compiled kernels of the tests.
 NO_SHARE = 1e-12
 
@@ -54,12 +51,9 @@ def has_curve(problem: object) -> bool:
 
 
 def relax(elastic: Array, branches: Sequence[tuple[float, float]], h: float) -> Array:
-    """Return the forces F_n of relaxing tissue [N], shape (frames,).
+    """Return the forces F_n of relaxing tissue [N], shape (frames,), from elastic ones f_n [N] at intervals of `h` [s].
 
-    Args:
-        elastic: elastic forces f_n [N], shape (frames,).
-        branches: share and time [s] of every branch.
-        h: time between frames [s].
+    Each branch is its share and time [s].
     """
     if not branches:
         return elastic
@@ -85,14 +79,7 @@ class _Tangent(NamedTuple):
 class CurveRuns(Runs):
     """Predictions of machine tests by curves or by a tangent, both plus one correction of every frame.
 
-    Args:
-        problem: the fit.
-        workers: ignored, as a curve is a single run.
-        progress: progress callback, as for `Runs`.
-
-    Attributes:
-        by_tangent: whether `predict_one` uses the tangent; otherwise it computes a curve.
-        changes_curve: mask of the parameters that change the curve, shape (n,).
+    `workers` are ignored, as a curve is a single run.
     """
 
     problem: MachineProblem
@@ -103,8 +90,9 @@ class CurveRuns(Runs):
         super().__init__(problem, 1, progress)
         self._curves: dict[tuple[object, ...], Array] = {}
         self._correction: Array | float = 0.0
-        self.by_tangent = True
+        self.by_tangent = True  # whether `predict_one` uses the tangent; otherwise it computes a curve
         keys = [parameter.key for parameter in self.problem.parameters]
+        # Mask of the parameters that change the curve, shape (n,).
         self.changes_curve = np.array([not key.startswith(("contact", "tissue.relaxation.")) for key in keys])
         self._is_contact = np.array([key.startswith("contact") for key in keys])
         self._is_lock = np.array([key.endswith(".lock") for key in keys])
@@ -137,12 +125,7 @@ class CurveRuns(Runs):
         return mesh_error(self._plan_curve(values, self._reach(values)), self._report_progress)
 
     def run_curve(self, x: Array, halvings: int = 0) -> Prediction:
-        """Return the prediction by a curve at x; raise the errors of `ForwardModel.predict`.
-
-        Args:
-            x: coordinates of the parameters, shape (n,).
-            halvings: number of halvings of the cells per side.
-        """
+        """Return the prediction by a curve at x, shape (n,); raise the errors of `ForwardModel.predict`."""
         values = self._model.values(x)
         reach = self._reach(values)
         return self._predict(values, reach, self._forces(values, reach, halvings))
@@ -153,12 +136,7 @@ class CurveRuns(Runs):
         return self._model.predict(x, pause=self._report_progress)
 
     def correct(self, x: Array, predicted: Prediction) -> None:
-        """Add the error of the tangent at x to all further predictions.
-
-        Args:
-            x: coordinates of the parameters, shape (n,).
-            predicted: prediction at x by a curve, or by runs of the tests.
-        """
+        """Add the error of the tangent at x to all further predictions; `predicted` is by a curve, or by the tests."""
         if (by_tangent := self.predict_one(x)) is not None:
             self._correction = self._correction + predicted.values[0] - by_tangent.values[0]
 
@@ -196,14 +174,11 @@ class CurveRuns(Runs):
     def trust_region(self, x: Array, region: Array) -> tuple[Array, Array]:
         """Return the smallest and largest coordinates within bounds and within the reach of the curve, shape (n,) each.
 
-        Args:
-            x: centre, shape (n,).
-            region: half width in every coordinate, shape (n,).
+        `region`: half width around x in every coordinate, shape (n,).
         """
         low, high = self.problem.limits
-        region = np.maximum(
-            region, MIN_REGION
-        )  # A parameter without effect does not move, which shrinks its region to 0.
+        # A parameter without effect does not move, which shrinks its region to 0.
+        region = np.maximum(region, 1e-6)
         margin = np.array(
             [CONTACT_MARGIN * self._tangent.reach / (parameter.scale or 1) for parameter in self.problem.parameters]
         )
@@ -278,18 +253,8 @@ class CurveRuns(Runs):
 def search_by_curve(runs: CurveRuns, misfit: Misfit, start: Array, initial: Prediction) -> tuple[Search, Solution]:
     """Minimise the misfit by tangents, then by curves, then by runs of the tests.
 
-    Args:
-        runs: predictions.
-        misfit: residuals.
-        start: initial coordinates of the parameters, shape (n,).
-        initial: prediction at `start`.
-
-    Returns:
-        The search, whose Jacobian is that of the last tangent, and the solution, with the forces of runs of the tests.
-
-    Raises:
-        SceneError: when the scene is invalid in the neighbourhood of the solution.
-        DivergedError: when the run of a curve diverges.
+    Return the search, whose Jacobian is that of the last tangent, and the solution, with the forces of runs of the
+    tests.
     """
     search = Search(runs, misfit)
     solution = _descend(runs, misfit, _scale_stiffnesses(runs, misfit, start, initial), by_tests=False)

@@ -24,19 +24,12 @@ MAX_CONTACT_EFFECT = 1.5
 
 @dataclass(frozen=True, eq=False)
 class FittedTest:
-    """Machine test with the forces of the fitted scene.
+    """Machine test with the forces of the fitted scene."""
 
-    Attributes:
-        loading: the test, sampled at frames, without the fitted offset.
-        contact: depth of contact, fitted or given, as in the table [m].
-        force: fitted force at every frame [N], shape (frames,).
-        offset_error: standard error of the offset [N].
-    """
-
-    loading: Loading
-    contact: float
-    force: Array
-    offset_error: float = 0.0
+    loading: Loading  # without the fitted offset
+    contact: float  # depth of contact, fitted or given, as in the table [m]
+    force: Array  # fitted force at every frame [N], shape (frames,)
+    offset_error: float = 0.0  # standard error of the offset [N]
 
     @property
     def residual(self) -> float:
@@ -70,12 +63,8 @@ def fitted_tests(
 ) -> tuple[FittedTest, ...]:
     """Return the fitted tests, without their offsets, the weighted means of measured minus fitted forces.
 
-    Args:
-        problem: the fit.
-        values: fitted values of the parameters by key.
-        forces: fitted forces of all tests [N], shape (frames of all tests, 1).
-        slopes: their derivatives by x [N], shape (frames of all tests, n).
-        uncertainties: uncertainty of the solution.
+    The fitted forces [N] have shape (frames of all tests, 1), their derivatives by x, `slopes`, (frames of all tests,
+    n).
     """
     tests, start = [], 0
     for loading, key in zip(problem.tests, problem.contact_keys, strict=True):
@@ -98,11 +87,7 @@ def contact_notes(
 ) -> Iterator[str]:
     """Yield a warning about estimated depths of contact whose errors exceed the intervals of parameters.
 
-    Args:
-        parameters: parameters of the fit.
-        x: their coordinates at the solution, shape (n,).
-        uncertainties: uncertainty of the solution.
-        slopes: derivatives of the residuals r by the estimated depths of contact [1/m], shape (known, contacts).
+    `slopes`: derivatives of the residuals r by these depths [1/m], shape (known, contacts).
     """
     # Step to the minimum with free depths of contact, and its standard deviations.
     inverse = np.linalg.pinv(np.column_stack([uncertainties.weighted, slopes]))
@@ -119,12 +104,7 @@ def contact_notes(
 
 
 def unknown_notes(tests: Sequence[FittedTest], values: Mapping[str, float]) -> Iterator[str]:
-    """Yield the reasons why parameters are not identifiable.
-
-    Args:
-        tests: the fitted tests.
-        values: values of the unidentifiable parameters by key.
-    """
+    """Yield the reasons why parameters are not identifiable; `values`: those of these parameters by key."""
     for key, value in values.items():
         if key.startswith("tissue.relaxation.") and key.endswith(".time"):
             shortest = min(fitted.rise for fitted in tests)
@@ -142,12 +122,7 @@ def unknown_notes(tests: Sequence[FittedTest], values: Mapping[str, float]) -> I
 
 
 def explanations(tests: Sequence[FittedTest], *, fits_contact: bool) -> Iterator[str]:
-    """Yield probable reasons for the rejection of a model: relaxation, contact, curvature, or a sign.
-
-    Args:
-        tests: the fitted tests.
-        fits_contact: whether depths of contact are fitted, which excludes them as a reason.
-    """
+    """Yield probable reasons for the rejection of a model: relaxation, curvature, a sign, or an unfitted contact."""
     for fitted in tests:
         if reason := _explain(fitted, fits_contact=fits_contact):
             yield f"{fitted.loading.test.name}: {reason}"

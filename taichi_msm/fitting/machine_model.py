@@ -35,9 +35,6 @@ TABLE_SUFFIXES = (".csv", ".tsv", ".txt", ".xlsx")
 TABLE_OPTIONS = ("columns", "sheet", "block", "window", "rate", "contact")
 POINT_OPTIONS = ("sigma", "correlation", "drift", "resolution")
 
-# Number of reweighted means for the offset of a robust fit.
-ROBUST_STEPS = 20
-
 
 @dataclass(frozen=True, eq=False)
 class MachineForces(Forces, ObservationModel):
@@ -45,10 +42,6 @@ class MachineForces(Forces, ObservationModel):
 
     The observation is its own model: the map from the run of a test to these forces. The force of every test has an
     unknown offset.
-
-    Attributes:
-        approach: straight path of the tool.
-        tests: the tests, sampled at frames.
     """
 
     is_independent: ClassVar[bool] = False  # Their chi-square is the total.
@@ -72,7 +65,7 @@ class MachineForces(Forces, ObservationModel):
             part = (part.T * (unit > 0)).T
             centred = part - np.multiply.outer(unit, unit @ part / (unit @ unit))
             if robust_factor is not None:
-                for _ in range(ROBUST_STEPS):
+                for _ in range(20):  # reweighted means
                     weights = unit / np.sqrt(robust_factor(centred))
                     centred = part - unit * (weights @ part / (weights @ unit))
             parts.append(centred)
@@ -92,12 +85,7 @@ class MachineForces(Forces, ObservationModel):
 
 @dataclass(frozen=True, eq=False)
 class MachineProblem(FitProblem):
-    """Scene, parameters and machine tests of a fit.
-
-    Attributes:
-        tests: tests, sampled at frames.
-        approach: straight path of the tool.
-    """
+    """Scene, parameters and machine tests of a fit."""
 
     # Forward differences are sufficient for smooth forces at many frames.
     signs: ClassVar[tuple[int, ...]] = (1,)
@@ -114,24 +102,13 @@ class MachineProblem(FitProblem):
         return MachineModel(self, threads)
 
     def fitted_data(self, data: dict[str, Any], values: Mapping[str, float], n: int = 0) -> dict[str, Any]:
-        """Return a scene's data with parameter values, and with path and times of a test.
-
-        Args:
-            data: data of a scene, from `as_data`.
-            values: values of all parameters by key.
-            n: index of the test.
-        """
+        """Return a scene's data with parameter values, and with path and times of test `n`."""
         test, contact = self.tests[n], values.get(self.contact_keys[n])
         data = self.with_scene_values(data, values)
         return self.approach.place(data, test.travel(contact), test.rate)
 
     def with_scene_values(self, data: dict[str, Any], values: Mapping[str, float]) -> dict[str, Any]:
-        """Return a scene's data with parameter values, and with unchanged path and times.
-
-        Args:
-            data: data of a scene, from `as_data`.
-            values: values of all parameters by key; depths of contact are ignored.
-        """
+        """Return a scene's data with parameter values, except depths of contact, and with unchanged path and times."""
         of_scene = [parameter for parameter in self.parameters if parameter.key not in self.contact_keys]
         return with_values(data, of_scene, values)
 
@@ -164,13 +141,7 @@ class MachineModel(ForwardModel):
         return Prediction((np.concatenate(forces),), most_steps, np.zeros(1))
 
     def forces(self, simulation: Simulation, plan: Plan, pause: Pause) -> Array:
-        """Return the forces of a run along the tool's direction [N], shape (frames, 1).
-
-        Args:
-            simulation: simulation at its first frame.
-            plan: plan of the simulation.
-            pause: called several times a second.
-        """
+        """Return the forces of a run along the tool's direction [N], shape (frames, 1), from its first frame."""
         (observed,) = self.problem.observations
         frames = plan.grid.frames + 1
         model = observed.build_model(plan.scene, frames)
@@ -208,19 +179,7 @@ def read_machine_problem(
     forces: object,
     method: Method,
 ) -> MachineProblem:
-    """Return the fit problem of machine tables.
-
-    Args:
-        paths: paths of the tables.
-        scene: the scene with its initial values.
-        free: keys of the parameters.
-        bounds: smallest and largest values by key.
-        forces: value of --forces, must be None.
-        method: options of `fit`.
-
-    Raises:
-        SceneError: when a table, the scene or an option is invalid.
-    """
+    """Return the fit problem of machine tables; `forces`, the value of --forces, must be None."""
     if forces is not None:
         raise SceneError([f"--forces: {paths[0]} contains forces already; leave the option out"])
     if unused := [name for name in POINT_OPTIONS if method.get(name) is not None]:

@@ -211,23 +211,12 @@ class Observation(ABC):
 
 
 def time_in_frames(scene: Scene, time: Array) -> Array:
-    """Return times in frames, rounded to six decimals, so that times of frames become integers.
-
-    Args:
-        scene: scene with the frame rate.
-        time: times [s], any shape.
-    """
+    """Return times [s], any shape, in frames, rounded to six decimals, so that times of frames become integers."""
     return np.round(time * scene.time.frames_per_second, 6)
 
 
 def time_weights(scene: Scene, time: Array, frames: int) -> Any:
-    """Return the sparse matrix of linear interpolation between frames, shape (T, frames).
-
-    Args:
-        scene: scene with the frame rate.
-        time: times [s], shape (T,).
-        frames: number of frames.
-    """
+    """Return the sparse matrix of linear interpolation between frames, shape (T, frames), at times [s], shape (T,)."""
     from scipy.sparse import csr_matrix
 
     position, row = time_in_frames(scene, time), np.arange(len(time))
@@ -239,10 +228,7 @@ def time_weights(scene: Scene, time: Array, frames: int) -> Any:
 def opposed_axes(observed: Array, predictions: Sequence[Array], sigma: Any) -> list[int]:
     """Return the indices of the components that are significant, and opposite to all predictions.
 
-    Args:
-        observed: observed values, shape (..., components), NaN where not observed.
-        predictions: predicted values, each of the same shape.
-        sigma: standard deviation of the errors, or None if unknown.
+    Arrays have the shape (..., components), NaN where unknown; `sigma` is None if unknown.
     """
     size = observed.shape[-1]
     is_opposed = np.ones(size, np.bool_)

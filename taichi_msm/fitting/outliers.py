@@ -30,17 +30,11 @@ MIN_SHARE = 1e-4
 
 @dataclass(frozen=True, eq=False)
 class LeftOut:
-    """Outliers of an observation.
+    """Outliers of an observation."""
 
-    Attributes:
-        noun: name of the values of the observation.
-        mask: mask of the outliers, with the shape of the values without components.
-        known: number of samples, with the outliers.
-    """
-
-    noun: str
-    mask: NDArray[np.bool_]
-    known: int
+    noun: str  # of the observation
+    mask: NDArray[np.bool_]  # outliers, with the shape of the values without components
+    known: int  # number of samples, including the outliers
 
     @property
     def share(self) -> float:
@@ -57,14 +51,9 @@ class LeftOut:
 
 
 def leave_out(search: Search, solution: Solution) -> tuple[Solution, list[LeftOut]]:
-    """Fit the observations without outliers by least squares.
+    """Fit the observations without outliers by least squares; the misfit of the search becomes that of the rest.
 
-    Args:
-        search: robust search; its misfit becomes that of the rest.
-        solution: its solution.
-
-    Returns:
-        The solution of the rest, and the outliers of every observation.
+    Return the solution of the rest, and the outliers of every observation.
     """
     everything, left_out = search.misfit, None
     for _ in range(MAX_FITS):

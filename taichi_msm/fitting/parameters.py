@@ -40,21 +40,13 @@ def rounded(number: float) -> str:
 
 @dataclass(frozen=True)
 class Parameter:
-    """Fitted number of a scene, as a function of a coordinate x, which is initially 0.
+    """Fitted number of a scene, as a function of a coordinate x, which is initially 0."""
 
-    Attributes:
-        key: dotted path.
-        start: initial value.
-        low: smallest value, may be infinite.
-        high: largest value, may be infinite.
-        scale: x = (value - start) / scale; with a scale of 0 x = log(value / start).
-    """
-
-    key: str
-    start: float
-    low: float
-    high: float
-    scale: float
+    key: str  # dotted path
+    start: float  # initial value
+    low: float  # smallest value, may be infinite
+    high: float  # largest value, may be infinite
+    scale: float  # x = (value - start) / scale; with a scale of 0 x = log(value / start)
 
     @property
     def path(self) -> Key:
@@ -84,21 +76,11 @@ class Parameter:
         )
 
     def error(self, x: float, deviation: float) -> float:
-        """Return the standard deviation of the value.
-
-        Args:
-            x: coordinate.
-            deviation: standard deviation of x.
-        """
+        """Return the standard deviation of the value from that of x."""
         return deviation * (abs(self.value(x)) if self.is_log else self.scale)
 
     def relative_error(self, x: float, deviation: float) -> float:
-        """Return the standard deviation as a share of the value, of a coordinate or time as a share of its range.
-
-        Args:
-            x: coordinate.
-            deviation: standard deviation of x.
-        """
+        """Return the standard deviation as a share of the value, of a coordinate or time as a share of its range."""
         if self.is_log:
             return deviation
         unit = self.scale if _is_coordinate(self.path) else abs(self.value(x))
@@ -106,16 +88,7 @@ class Parameter:
 
 
 def make_parameters(scene: Scene, free: Sequence[str], bounds: Mapping[str, Bounds]) -> tuple[Parameter, ...]:
-    """Return the parameters of a fit.
-
-    Args:
-        scene: the scene with its initial values.
-        free: keys of the parameters.
-        bounds: smallest and largest values by key.
-
-    Raises:
-        SceneError: when keys or bounds are invalid, with all faults.
-    """
+    """Return the parameters of a fit; raise a SceneError with all faults of keys and bounds."""
     data, faults, parameters = as_data(scene), [], []
     if not free:
         faults.append("--free: names no key; take one or more, such as --free tissue.young")
@@ -195,7 +168,6 @@ def _is_coordinate(path: Key) -> bool:
 
 
 def _default_range(scene: Scene, path: Key) -> float:
-    """Return the default range of a coordinate."""
     time, last = scene.time.duration, path[-1]
     if path[0] == "render":
         if last in ("cx", "cy"):
@@ -220,13 +192,7 @@ def as_data(scene: Scene) -> dict[str, Any]:
 
 
 def with_values(data: dict[str, Any], parameters: Sequence[Parameter], values: Mapping[str, float]) -> dict[str, Any]:
-    """Return a copy of a scene's data with other values of parameters.
-
-    Args:
-        data: data of a scene, from `as_data`.
-        parameters: the parameters to be replaced.
-        values: their values by key.
-    """
+    """Return a copy of a scene's data, from `as_data`, with other values of parameters."""
     changed = deepcopy(data)
     for parameter in parameters:
         container: Any = changed
@@ -255,17 +221,7 @@ class Method(TypedDict, total=False):
 
 
 def require_types(observed: Any, free: Any, method: Mapping[str, Any], **others: Any) -> None:
-    """Check the types of the arguments of `fit`.
-
-    Args:
-        observed: observations.
-        free: keys of the parameters.
-        method: options of the method.
-        others: further arguments by name; None where they are not given.
-
-    Raises:
-        ArgumentError: when an argument has a wrong type, or an option does not exist; for the first fault.
-    """
+    """Raise an ArgumentError for the first argument of `fit` of a wrong type, or for an unknown option."""
     known = Method.__annotations__
     if unknown := sorted(set(method) - set(known)):
         raise ArgumentError(f"{unknown[0]}: unknown; take {', '.join(known)}{did_you_mean(unknown[0], known)}")

@@ -39,12 +39,7 @@ Panel = Callable[[Axes], None]
 
 
 def plot(result: FitResult, file: BinaryIO) -> None:
-    """Write fit.png.
-
-    Args:
-        result: result of the fit.
-        file: binary file for the PNG.
-    """
+    """Write fit.png."""
     with style.context(STYLE, after_reset=True), warnings.catch_warnings():
         # A name may contain characters that the font lacks, and a point may have no observations.
         warnings.filterwarnings("ignore", "Glyph .* missing")
@@ -72,13 +67,7 @@ def _figure(result: FitResult) -> Figure:
 
 
 def observation_panels(observed: Observation, fitted: Array, result: FitResult) -> list[Panel]:
-    """Return the panels of an observation.
-
-    Args:
-        observed: the observation.
-        fitted: its values in the fitted scene, with their shape.
-        result: result of the fit.
-    """
+    """Return the panels of an observation; `fitted`: its values in the fitted scene."""
     if isinstance(observed, PointObservation):
         point_count, time_count = (int(observed.is_observed.any(axis=axis).sum()) for axis in (1, 0))
         # A single time shows no motion, a single point no map of residuals.
@@ -137,7 +126,6 @@ def _plot_match(axes: Axes, observed: PointObservation, fitted: Array) -> None:
 
 
 def _plot_residuals(axes: Axes, observed: PointObservation, fitted: Array, sheet: Sheet) -> None:
-    """Plot the residual of every point on the sheet."""
     scale, unit = _plotted_unit(observed)
     residuals = scale * np.sqrt(np.nanmean((fitted - observed.values) ** 2, axis=(1, 2)))
     across, down = observed.coordinates.T
@@ -149,7 +137,6 @@ def _plot_residuals(axes: Axes, observed: PointObservation, fitted: Array, sheet
 
 
 def _plot_forces(axes: Axes, observed: ToolForces, fitted: Array) -> None:
-    """Plot the force of every tool over time."""
     for probe in np.unique(observed.probe):
         rows = np.flatnonzero(observed.probe == probe)
         rows = rows[np.argsort(observed.time[rows])]
@@ -198,7 +185,6 @@ def _plot_test_residual(axes: Axes, fitted: FittedTest) -> None:
 
 
 def _plot_parameter(axes: Axes, result: FitResult, key: str) -> None:
-    """Plot the profile of a parameter and its interval."""
     estimate, (x, deviations) = result.parameters[key], np.array(result.curves[key]).T
     axes.plot(x, deviations**2, ".-", color=BLUE)
     axes.axvline(estimate.value, color=GREY, linewidth=0.8)

@@ -39,13 +39,7 @@ MIN_ERROR_CORRELATION = 0.3
 
 
 class PointModel(ObservationModel):
-    """Map from the mass points of a scene to observed points, and its adjoint.
-
-    Args:
-        scene: scene with mesh and camera.
-        observed: observed points and times.
-        frames: number of recorded frames.
-    """
+    """Map from the mass points of a scene to observed points, and its adjoint."""
 
     def __init__(self, scene: Scene, observed: PointObservation, frames: int) -> None:
         from scipy.sparse import csr_matrix
@@ -89,9 +83,7 @@ class PointModel(ObservationModel):
     def backward(self, points: Array, gradient: Array) -> Array:
         """Return the gradient of a loss by the positions of all frames, shape (frames, rows, cols, 3).
 
-        Args:
-            points: predicted points [m], shape (N, T, 3).
-            gradient: gradient by the values, shape (N, T, 3 or 2).
+        Predicted points [m] have shape (N, T, 3), the gradient by the values (N, T, 3 or 2).
         """
         gradient = self._observed.backward(self.scene, points, gradient)
         at_frames = self._time_weights.T @ gradient.swapaxes(0, 1).reshape(gradient.shape[1], -1)
@@ -100,37 +92,24 @@ class PointModel(ObservationModel):
 
 
 class Conventions(NamedTuple):
-    """Expected place of points at rest, and remedies for another camera or origin.
+    """Expected place of points at rest, and remedies for another camera or origin."""
 
-    Attributes:
-        tolerance: largest offset of correct points at rest [m] or [px].
-        place: clause on the expected place of points at rest.
-        remedy: remedy for a wrong camera or origin.
-        mirror_remedies: remedies for mirrored x, and for mirrored y.
-    """
-
-    tolerance: float
-    place: str
-    remedy: str
-    mirror_remedies: tuple[str, str]
+    tolerance: float  # largest offset of correct points at rest [m] or [px]
+    place: str  # clause on the expected place of points at rest
+    remedy: str  # for a wrong camera or origin
+    mirror_remedies: tuple[str, str]  # for mirrored x, and for mirrored y
 
 
 @dataclass(frozen=True, eq=False)
 class PointObservation(Observation):
-    """Tracks of N points at T times; values of shape (N, T, 3 or 2), times of shape (T,).
-
-    Attributes:
-        kind: name of the array of values in a file.
-        correlation_remedy: remedy for correlated errors of neighbouring points, or an empty string.
-        coordinates: across and down as fractions of the sheet, shape (N, 2).
-    """
+    """Tracks of N points at T times; values of shape (N, T, 3 or 2), times of shape (T,)."""
 
     noun: ClassVar[str] = "coordinates"
-    kind: ClassVar[str]
-    correlation_remedy: ClassVar[str]
+    kind: ClassVar[str]  # name of the array of values in a file
+    correlation_remedy: ClassVar[str]  # remedy for correlated errors of neighbouring points, or an empty string
 
     sigma: float | None
-    coordinates: Array
+    coordinates: Array  # across and down as fractions of the sheet, shape (N, 2)
 
     @property
     def is_observed(self) -> NDArray[np.bool_]:
@@ -147,22 +126,11 @@ class PointObservation(Observation):
 
     @abstractmethod
     def observe(self, scene: Scene, points: Array) -> Array:
-        """Return the values of points, shape (N, T, 3 or 2), NaN where a point has no pixel.
-
-        Args:
-            scene: scene with the camera.
-            points: positions [m], shape (N, T, 3).
-        """
+        """Return the values of points [m], shape (N, T, 3), as (N, T, 3 or 2), NaN where a point has no pixel."""
 
     @abstractmethod
     def backward(self, scene: Scene, points: Array, gradient: Array) -> Array:
-        """Return the gradient of a loss by the points, shape (N, T, 3).
-
-        Args:
-            scene: scene with the camera.
-            points: positions [m], shape (N, T, 3).
-            gradient: gradient by the values, shape (N, T, 3 or 2).
-        """
+        """Return the gradient of a loss by points [m], both (N, T, 3), from that by values, shape (N, T, 3 or 2)."""
 
     @abstractmethod
     def conventions(self, scene: Scene) -> Conventions:

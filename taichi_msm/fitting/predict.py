@@ -31,35 +31,23 @@ from taichi_msm.system.process import available_memory, available_threads
 
 
 class Prediction(NamedTuple):
-    """Predicted observations.
+    """Predicted observations."""
 
-    Attributes:
-        values: predicted values of every observation, with its shape; NaN where a point is behind the camera.
-        steps: number of steps per frame.
-        motion: largest displacement of the observed points at every simulated frame [m], shape (frames,).
-    """
-
+    # Predicted values of every observation, with its shape; NaN where a point is behind the camera.
     values: tuple[Array, ...]
-    steps: int
-    motion: Array
+    steps: int  # per frame
+    motion: Array  # largest displacement of the observed points at every simulated frame [m], shape (frames,)
 
 
 @dataclass(frozen=True, eq=False)
 class FitProblem:
-    """Scene, parameters and observations of a fit.
+    """Scene, parameters and observations of a fit."""
 
-    Attributes:
-        signs: sides of the finite differences at the solution: (1, -1) central, (1,) forward.
-        token: identifier of the fit in worker processes.
-        scene: scene with its initial values.
-        parameters: parameters of the fit.
-        observations: observations of the fit.
-    """
-
+    # Sides of the finite differences at the solution: (1, -1) central, (1,) forward.
     signs: ClassVar[tuple[int, ...]] = (1, -1)
 
-    token: str
-    scene: Scene
+    token: str  # identifier of the fit in worker processes
+    scene: Scene  # with its initial values
     parameters: tuple[Parameter, ...]
     observations: tuple[Observation, ...]
 
@@ -74,12 +62,7 @@ class FitProblem:
         return ForwardModel(self, threads)
 
     def fitted_data(self, data: dict[str, Any], values: Mapping[str, float]) -> dict[str, Any]:
-        """Return a scene's data with parameter values.
-
-        Args:
-            data: data of a scene, from `as_data`.
-            values: values of all parameters by key.
-        """
+        """Return a scene's data, from `as_data`, with parameter values by key."""
         return with_values(data, self.parameters, values)
 
 
@@ -90,12 +73,7 @@ def without_outputs(scene: Scene) -> Scene:
 
 
 class ForwardModel:
-    """Forward model of a fit: a simulation that is restarted for every prediction.
-
-    Args:
-        problem: the fit.
-        threads: number of threads; all cores if it is None.
-    """
+    """Forward model of a fit: a simulation that is restarted for every prediction."""
 
     def __init__(self, problem: FitProblem, threads: int | None) -> None:
         self.problem, self.data = problem, as_data(problem.scene)
@@ -114,18 +92,11 @@ class ForwardModel:
         to_end: bool = False,
         pause: Pause = lambda: None,
     ) -> Prediction:
-        """Return the prediction of a run with the parameters at x.
+        """Return the prediction of a run with the parameters at x, shape (n,).
 
-        Args:
-            x: coordinates of the parameters, shape (n,).
-            steps: smallest number of steps per frame; by default enough for finite differences around x.
-            halvings: number of halvings of the cells per side.
-            to_end: whether to simulate to the last frame, beyond the last observation.
-            pause: called several times a second; an exception from it ends the run.
-
-        Raises:
-            SceneError: when the scene with these values is not valid, or has too few mass points to be coarsened.
-            DivergedError: when the run diverges.
+        `steps` is the smallest number per frame, by default enough for finite differences around x; `halvings` is that
+        of the cells per side; `to_end` simulates to the last frame, beyond the last observation. Raise a SceneError for
+        an invalid scene or too few mass points to be coarsened, a DivergedError for a diverging run.
         """
         simulation, plan = self.start(self.plan(x), steps, halvings)
         # The mesh of a coarse run differs.
@@ -137,19 +108,7 @@ class ForwardModel:
         return Prediction(values, plan.grid.steps_per_frame, motion)
 
     def start(self, plan: Plan, steps: int | None, halvings: int) -> tuple[Simulation, Plan]:
-        """Restart the simulation.
-
-        Args:
-            plan: plan of the run.
-            steps: smallest number of steps per frame; None as for `predict`.
-            halvings: number of halvings of the cells per side.
-
-        Returns:
-            The simulation, and its plan with these cells and steps.
-
-        Raises:
-            SceneError: when the plan has too few mass points to be coarsened.
-        """
+        """Restart the simulation; return it, and its plan with the cells and steps, as for `predict`."""
         for _ in range(halvings):
             if (coarser := coarser_plan(plan)) is None:
                 raise SceneError(["sheet.points: too few to take half of them"])
@@ -167,23 +126,12 @@ class ForwardModel:
         return self._simulation, plan
 
     def compile(self, x: Array, pause: Pause) -> None:
-        """Compile the kernels; raise a SceneError if the scene at x is invalid.
-
-        Args:
-            x: coordinates of the parameters, shape (n,).
-            pause: called several times a second.
-        """
+        """Compile the kernels; raise a SceneError if the scene at x is invalid."""
         self._simulation = Simulation(self.plan(x), threads=self._threads)
         self._simulation.compile(pause)
 
     def try_predict(self, x: Array, steps: int | None = None, **options: Any) -> Prediction | None:
-        """Return the prediction at x, or None if the run fails or an observed point is behind the camera.
-
-        Args:
-            x: coordinates of the parameters, shape (n,).
-            steps: smallest number of steps per frame; None as for `predict`.
-            options: further arguments of `predict`.
-        """
+        """Return the prediction at x, or None if the run fails or an observed point is behind the camera."""
         try:
             predicted = self.predict(x, steps, **options)
         except (SceneError, DivergedError):
@@ -206,14 +154,7 @@ class ForwardModel:
     def record(
         self, models: Sequence[ObservationModel], simulation: Simulation, frames: int, pause: Pause
     ) -> list[Array]:
-        """Return the records of a run: for each model those of all frames, stacked.
-
-        Args:
-            models: observation models.
-            simulation: simulation at its first frame.
-            frames: number of frames, including the first one.
-            pause: called several times a second.
-        """
+        """Return the records of a run from its first frame: for each model those of all frames, stacked."""
         records: list[list[Array]] = [[] for _ in models]
         for frame in range(frames):
             simulation.advance(min(frame, 1), pause)
@@ -240,13 +181,7 @@ _cached_models: dict[str, ForwardModel] = {}
 
 
 def predict_in_worker(problem: FitProblem, x: Array, steps: int | None) -> Prediction | None:
-    """Return the result of `ForwardModel.try_predict` in a worker process, on one thread.
-
-    Args:
-        problem: the fit; its forward model is kept for the next call.
-        x: coordinates of the parameters, shape (n,).
-        steps: smallest number of steps per frame; None as for `ForwardModel.predict`.
-    """
+    """Return the result of `ForwardModel.try_predict` on one thread; the forward model is kept for the next call."""
     if problem.token not in _cached_models:
         for token in list(_cached_models):
             _cached_models.pop(token).close()
@@ -257,12 +192,7 @@ def predict_in_worker(problem: FitProblem, x: Array, steps: int | None) -> Predi
 def mesh_error(plan: Plan, pause: Pause) -> float | None:
     """Return the estimated mesh error, as a fraction of the largest displacement.
 
-    Args:
-        plan: plan of the run.
-        pause: called several times a second.
-
-    Returns:
-        The error, or None for springs, with too few mass points, or if a coarser run fails.
+    Return None for springs, with too few mass points, or if a coarser run fails.
     """
     if coarser_plan(plan) is None:
         return None
@@ -276,11 +206,8 @@ def mesh_error(plan: Plan, pause: Pause) -> float | None:
 class Runs:
     """Execution of the runs of a fit, in this process or in a pool; a context manager, which ends the pool.
 
-    Args:
-        problem: the fit.
-        workers: number of worker processes, 1 for no pool; by default chosen by the duration of the first run.
-        progress: called often with the stage, the finished and the expected number of runs; an exception from it ends
-            the fit.
+    One worker is no pool; by default their number is chosen by the duration of the first run. An exception from
+    `progress` ends the fit.
     """
 
     def __init__(self, problem: FitProblem, workers: int | None, progress: StageProgressCallback) -> None:
@@ -300,12 +227,7 @@ class Runs:
         return predicted
 
     def predict_coarse(self, x: Array, halvings: int) -> Prediction | None:
-        """Return the prediction of a coarser mesh, or None if it fails.
-
-        Args:
-            x: coordinates of the parameters, shape (n,).
-            halvings: number of halvings of the cells per side.
-        """
+        """Return the prediction of a coarser mesh, or None if it fails."""
         self.count += 1
         return self._model.try_predict(x, halvings=halvings, pause=self._report_progress)
 
@@ -314,27 +236,14 @@ class Runs:
         return mesh_error(self._model.plan(x), self._report_progress)
 
     def predict_one(self, x: Array, steps: int | None = None) -> Prediction | None:
-        """Return the prediction at x, or None if it fails.
-
-        Args:
-            x: coordinates of the parameters, shape (n,).
-            steps: smallest number of steps per frame; None as for `ForwardModel.predict`.
-        """
+        """Return the prediction at x, or None if it fails."""
         self._report_progress()
         predicted = self._model.try_predict(x, steps, pause=self._report_progress)
         self.count += 1
         return predicted
 
     def predict_many(self, coordinates: Sequence[Array], steps: int | None = None) -> list[Prediction | None]:
-        """Return predictions in parallel if that pays off, each None if it fails.
-
-        Args:
-            coordinates: coordinates of the parameters of every run, each of shape (n,).
-            steps: smallest number of steps per frame; None as for `ForwardModel.predict`.
-
-        Raises:
-            ExecutorError: when a worker process dies.
-        """
+        """Return predictions in parallel if that pays off, each None if it fails. A dead process is an error."""
         if self._pool is None and (workers := self._choose_workers()) > 1:
             self._pool = Pool(workers)
         if self._pool is None or len(coordinates) < 2:

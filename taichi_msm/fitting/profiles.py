@@ -28,40 +28,22 @@ Side = Generator[Array, "Prediction | None", "list[ProfilePoint]"]
 
 
 class ProfilePoint(NamedTuple):
-    """Point of a profile.
-
-    Attributes:
-        x: coordinate of the parameter.
-        deviations: signed sqrt(2 rise of the cost / f) / widening; infinite where runs fail.
-    """
+    """Point of a profile."""
 
     x: float
-    deviations: float
+    deviations: float  # signed sqrt(2 rise of the cost / f) / widening; infinite where runs fail
 
 
 class Profile(NamedTuple):
-    """Profile of a parameter.
+    """Profile of a parameter."""
 
-    Attributes:
-        points: points of the profile, sorted by x.
-        low: lower end of the 95 % interval, or None beyond the bounds.
-        high: upper end, or None beyond the bounds.
-    """
-
-    points: list[ProfilePoint]
-    low: float | None
-    high: float | None
+    points: list[ProfilePoint]  # sorted by x
+    low: float | None  # lower end of the 95 % interval, or None beyond the bounds
+    high: float | None  # upper end, likewise
 
 
 class Profiler:
-    """Profile likelihood of a solution's parameters.
-
-    Args:
-        runs: predictions.
-        misfit: residuals.
-        solution: minimum of their cost.
-        uncertainties: uncertainty of the solution.
-    """
+    """Profile likelihood of a solution's parameters."""
 
     def __init__(self, runs: Runs, misfit: Misfit, solution: Solution, uncertainties: Uncertainty) -> None:
         self._runs, self._misfit, self._solution, self._uncertainties = runs, misfit, solution, uncertainties
@@ -134,8 +116,7 @@ class Profiler:
     ) -> Generator[Array, Prediction | None, tuple[float, Array, bool]]:
         """Minimise over the other parameters, and update the Jacobian.
 
-        Returns:
-            The cost, infinite if the run at x fails, its coordinates, and whether the search has converged.
+        Return the cost, infinite if the run at x fails, its coordinates, and whether the search has converged.
         """
         from scipy.optimize import lsq_linear
 

@@ -34,11 +34,7 @@ MIN_PRODUCTS = 24
 def by_chi_square(chi_square: float, freedom: int, independent: float, name: str = "chi-square") -> str | None:
     """Return the reason for rejection by an improbable chi-square, or None.
 
-    Args:
-        chi_square: sum of squared residuals.
-        freedom: degrees of freedom.
-        independent: effective number of independent residuals, at most `freedom`.
-        name: name of the sum, for the reason.
+    `independent`: effective number of independent residuals, at most the degrees of freedom.
     """
     from scipy.stats import chi2
 
@@ -56,16 +52,11 @@ def by_pattern(
     error_correlation: ErrorCorrelation,
     remedy: str,
 ) -> str | None:
-    """Return the reason for rejection by the pattern of the residuals, or None.
+    """Return the reason for rejection by the pattern of the residuals, predicted minus observed values, or None.
 
-    Args:
-        residuals: predicted minus observed values [m] or [px], shape (N, T, 3 or 2), NaN where not observed.
-        displacement: predicted displacement from rest, with the shape and unit of the residuals.
-        time: times of the observations [s], shape (T,).
-        coordinates: coordinates of the points on the sheet, shape (N, 2).
-        motion: root mean square of the observed motion [m] or [px].
-        error_correlation: given correlation of the errors.
-        remedy: remedy for correlated errors of neighbouring points, for the reason.
+    Residuals, NaN where not observed, and predicted displacements from rest have shape (N, T, 3 or 2); they are in m or
+    px, as is `motion`, the root mean square of the observed motion. Times [s] have shape (T,), coordinates on the sheet
+    (N, 2). The remedy is for correlated errors of neighbouring points.
     """
     if np.sqrt(np.nanmean(residuals**2)) < MIN_SHARE * motion:
         return None

@@ -34,12 +34,7 @@ def publication(directory: Path) -> Publication:
 
 
 def write_report(result: FitResult, published: Publication) -> None:
-    """Write and publish the files of a fit; without matplotlib, skip fit.png and add a note to the result.
-
-    Args:
-        result: result of the fit.
-        published: replacement of the directory.
-    """
+    """Write and publish the files of a fit; without matplotlib, skip fit.png and add a note to the result."""
     folder = published.new_folder
     names: dict[str, str] = {}
     for n, scene in enumerate([result.scene, *result.other_scenes]):

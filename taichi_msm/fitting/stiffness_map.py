@@ -36,42 +36,23 @@ KEY = "tissue.map"
 # Key of a component of a force.
 FORCE_KEY = re.compile(r"probes\.\d+\.total\.[012]")
 
-# Default bounds of the factors.
-DEFAULT_LOW, DEFAULT_HIGH = 0.1, 10.0
-
 # Largest bound of the factors, and the inverse of the smallest.
 MAX_FACTOR = 1e6
 
 
 @dataclass(frozen=True)
 class MapSettings:
-    """Settings of a fitted map.
+    """Settings of a fitted map."""
 
-    Attributes:
-        resolution: number of cells per side, R.
-        limits: bounds of the factors.
-        force: component of a force, whose fitted factor scales all forces; None for fixed forces.
-    """
-
-    resolution: int
-    limits: Bounds
-    force: Parameter | None
+    resolution: int  # R, cells per side
+    limits: Bounds  # of the factors
+    force: Parameter | None  # component of a force, whose fitted factor scales all forces; None for fixed forces
 
 
 def map_settings(
     scene: Scene, free: Sequence[str], bounds: Mapping[str, Bounds], resolution: int | None
 ) -> MapSettings | None:
-    """Return the settings of a map, or None for a fit of numbers.
-
-    Args:
-        scene: the scene with its initial values.
-        free: keys of the parameters.
-        bounds: smallest and largest values by key.
-        resolution: number of cells per side, or None.
-
-    Raises:
-        SceneError: when keys, bounds, resolution or scene do not allow the map.
-    """
+    """Return the settings of a map, or None for a fit of numbers; raise a SceneError if they are invalid."""
     if KEY not in free:
         if resolution is not None:
             raise SceneError([f"--resolution {resolution}: only for a map; add --free {KEY}"])
@@ -92,7 +73,7 @@ def map_settings(
     if unknown := [key for key in bounds if key not in free]:
         raise SceneError([f"--bounds {unknown[0]}: not among --free; take {KEY}=LOW,HIGH, factors of young"])
     low, high = bounds.get(KEY, (-math.inf, math.inf))
-    low, high = (DEFAULT_LOW if low == -math.inf else low), (DEFAULT_HIGH if high == math.inf else high)
+    low, high = (0.1 if low == -math.inf else low), (10.0 if high == math.inf else high)
     interval = f"--bounds {KEY}={low:g},{high:g}"
     if not 0 < low < high:
         raise SceneError([f"{interval}: take factors of young above 0, the smaller one first"])
@@ -107,19 +88,7 @@ def map_settings(
 def fit_map(
     scene: Scene, observations: PointObservation, settings: MapSettings, image: str, progress: StageProgressCallback
 ) -> FitResult:
-    """Return the fit of a map.
-
-    Args:
-        scene: the scene with its initial values.
-        observations: observed points, with sigma.
-        settings: settings of the map.
-        image: path of the map's picture in the fitted scene.
-        progress: called often; an exception from it ends the fit.
-
-    Raises:
-        SceneError: when the scene or the observations are invalid.
-        DivergedError: when a run diverges.
-    """
+    """Return the fit of a map; `image`: path of the map's picture in the fitted scene."""
     plan = _with_stable_steps(check_scene(without_outputs(scene)), settings.limits[1])
     require_differentiable(plan)
     if invalid := list(_faults(observations, scene, settings)):
@@ -264,13 +233,8 @@ def map_notes(
 ) -> Iterator[str]:
     """Yield warnings about a map.
 
-    Args:
-        observations: observed points, with sigma.
-        solution: solution found.
-        fitted_map: its map.
-        mesh_shift: root mean square change of the observations by the mesh [m] or [px].
-        limits: bounds of the logs of the factors.
-        residuals: predicted minus observed values [m] or [px], shape (known,).
+    `mesh_shift` [m] or [px]: root mean square change of the observations by the mesh; `limits`: bounds of the logs of
+    the factors; `residuals`: predicted minus observed values [m] or [px], shape (known,).
     """
     assert observations.sigma is not None
     if (unknown_count := int(fitted_map.unknown.sum())) > 0:

@@ -45,30 +45,17 @@ DIFFERENCE_STEP = 1e-2
 
 
 class SmoothnessWeight(NamedTuple):
-    """Weight w of the smoothness, chosen by the discrepancy principle.
+    """Weight w of the smoothness, chosen by the discrepancy principle."""
 
-    Attributes:
-        weight: w.
-        step: linearised change of x to the minimum with w, shape (R^2,).
-        weights: candidates, from the largest to w, shape (candidates,).
-        excess: excess of chi-square above its minimum, for each candidate, shape (candidates,).
-        expected: expected excess, shape (candidates,).
-    """
-
-    weight: float
-    step: Array
-    weights: Array
-    excess: Array
-    expected: Array
+    weight: float  # w
+    step: Array  # linearised change of x to the minimum with w, shape (R^2,)
+    weights: Array  # candidates, from the largest to w, shape (candidates,)
+    excess: Array  # of chi-square above its minimum, shape (candidates,)
+    expected: Array  # its expectation, shape (candidates,)
 
 
 def with_scaled_forces(scene: Scene, logs: Array) -> Scene:
-    """Return a scene with scaled forces of all tools.
-
-    Args:
-        scene: the scene.
-        logs: log of the common factor of the forces, shape (1,); empty for unchanged forces.
-    """
+    """Return a scene with scaled forces of all tools; `logs`: log of their common factor, shape (1,), or empty."""
     factor = float(np.exp(logs).prod())
     totals = [probe.total and tuple(factor * component for component in probe.total) for probe in scene.probes]
     probes = [probe.model_copy(update={"total": total}) for probe, total in zip(scene.probes, totals, strict=True)]
@@ -77,19 +64,12 @@ def with_scaled_forces(scene: Scene, logs: Array) -> Scene:
 
 @dataclass(frozen=True, eq=False)
 class Linearisation:
-    """Predictions linearised at a map.
+    """Predictions linearised at a map."""
 
-    Attributes:
-        x: logs of the factors of the map cells, shape (R^2,).
-        information: J^T J / variance, shape (R^2, R^2).
-        slope: gradient of chi-square / (2 variance) by x, shape (R^2,).
-        variance: variance of the residuals [sigma^2], chi-square of the best map per degree of freedom; at least 1.
-    """
-
-    x: Array
-    information: Array
-    slope: Array
-    variance: float
+    x: Array  # logs of the factors of the map cells, shape (R^2,)
+    information: Array  # J^T J / variance, shape (R^2, R^2)
+    slope: Array  # gradient of chi-square / (2 variance) by x, shape (R^2,)
+    variance: float  # variance of the residuals [sigma^2], chi-square of the best map per degree of freedom; at least 1
 
     def choose_weight(self, roughness: Array) -> SmoothnessWeight:
         """Choose the weight of L, `roughness`, shape (R^2, R^2), by the discrepancy principle."""
@@ -106,49 +86,26 @@ class Linearisation:
         return SmoothnessWeight(candidates[-1][0], step, *np.array(candidates).T)
 
     def errors(self, weight: float, roughness: Array) -> Array:
-        """Return the standard errors of x, shape (R^2,), NaN if unknown.
-
-        Args:
-            weight: w.
-            roughness: L, shape (R^2, R^2).
-        """
+        """Return the standard errors of x, shape (R^2,), NaN if unknown; `roughness`: L, shape (R^2, R^2)."""
         deviations = np.sqrt(np.diag(np.linalg.inv(self.information + weight * roughness)))
         return np.where(np.diag(self.information) * MAX_KNOWN_ERROR**2 >= 1, deviations, np.nan)
 
 
 @dataclass(frozen=True, eq=False)
 class MapSolution:
-    """Estimated map.
+    """Estimated map."""
 
-    Attributes:
-        x: logs of the factors, and of the factor of the forces if free, shape (R^2,) or (R^2 + 1,).
-        errors: standard errors of x, NaN if unknown.
-        variance: variance of the residuals [sigma^2], as in `Linearisation`.
-        choice: weight of the smoothness.
-    """
-
-    x: Array
-    errors: Array
-    variance: float
+    x: Array  # logs of the factors, and of the factor of the forces if free, shape (R^2,) or (R^2 + 1,)
+    errors: Array  # standard errors of x, NaN if unknown
+    variance: float  # variance of the residuals [sigma^2], as in `Linearisation`
     choice: SmoothnessWeight
 
 
 class MapSearch:
     """Estimation of a map.
 
-    Args:
-        adjoint: gradients of the scene.
-        model: observation model of the scene.
-        observations: observed points.
-        sigma: standard deviation of their errors, including the mesh error [m] or [px].
-        grid: cells of the map.
-        limits: bounds of the logs of the factors.
-        pause: called several times a second; an exception from it ends the search.
-        force_limits: bounds of the log of a common factor of all forces, the last entry of x, or None if forces are
-            fixed.
-
-    Attributes:
-        runs: number of finished runs.
+    `sigma` [m] or [px] includes the mesh error; `limits` are bounds of the logs of the factors. With `force_limits`,
+    the last entry of x is the log of a common factor of all forces. An exception from `pause` ends the search.
     """
 
     def __init__(
@@ -238,12 +195,7 @@ class MapSearch:
 
 
 class MapGrid:
-    """Interpolation from the R x R cells of a map to the cells of a sheet, that of `model.sheet.map_factors`.
-
-    Args:
-        resolution: R.
-        cells: rows and columns of the sheet's cells.
-    """
+    """Interpolation from the R x R cells of a map to the cells of a sheet, that of `model.sheet.map_factors`."""
 
     def __init__(self, resolution: int, cells: tuple[int, int]) -> None:
         self.resolution = resolution
@@ -258,12 +210,7 @@ class MapGrid:
         return np.asarray(self._down @ np.exp(x).reshape(self.resolution, -1) @ self._across.T)
 
     def backward(self, x: Array, gradient: Array) -> Array:
-        """Return the gradient of a loss by the logs x, shape (R^2,).
-
-        Args:
-            x: logs of the map cells, shape (R^2,).
-            gradient: gradient by the factors of the sheet's cells, with their shape.
-        """
+        """Return the gradient of a loss by the logs x, shape (R^2,), from that by the factors of the sheet's cells."""
         return np.asarray(np.exp(x) * (self._down.T @ gradient @ self._across).ravel())
 
     def roughness(self) -> Array:

@@ -49,29 +49,17 @@ MAX_RELATIVE_ERROR = 1.0
 
 @dataclass(frozen=True, eq=False)
 class Uncertainty:
-    """Uncertainty of n parameters, in units of x.
+    """Uncertainty of n parameters, in units of x."""
 
-    Attributes:
-        scales: standard deviations of the observations, given or estimated.
-        factor: f, at least 1.
-        freedom: degrees of freedom.
-        independent: effective number of independent observations.
-        residuals: r, shape (known,).
-        weighted: W^(1/2) J, shape (known, n).
-        directions: V, shape (n, n); columns are uncorrelated combinations of x, the most certain first.
-        root: F, shape (n, n), with C = F F^T.
-        widening: ratio of the deviations with K to those with K = 1, shape (n,).
-    """
-
-    scales: Scales
-    factor: float
+    scales: Scales  # given or estimated
+    factor: float  # f, at least 1
     freedom: int
-    independent: float
-    residuals: Array
-    weighted: Array
-    directions: Array
-    root: Array
-    widening: Array
+    independent: float  # effective number of independent observations
+    residuals: Array  # r, shape (known,)
+    weighted: Array  # W^(1/2) J, shape (known, n)
+    directions: Array  # V, shape (n, n); columns are uncorrelated combinations of x, the most certain first
+    root: Array  # F, shape (n, n), with C = F F^T
+    widening: Array  # ratio of the deviations with K to those with K = 1, shape (n,)
 
     @property
     def deviations(self) -> Array:
@@ -121,14 +109,7 @@ class Uncertainty:
 def uncertainty(
     misfit: Misfit, solution: Solution, derivatives: Array, error_correlation: ErrorCorrelation
 ) -> Uncertainty:
-    """Return the uncertainty of a solution.
-
-    Args:
-        misfit: residuals.
-        solution: minimum of their cost.
-        derivatives: Jacobian of the predictions by x, shape (known, n).
-        error_correlation: correlation of the errors, which defines K.
-    """
+    """Return the uncertainty of a solution; `derivatives`: Jacobian of the predictions by x, shape (known, n)."""
     parameters = len(solution.x)
     freedom = max(1, misfit.freedom - parameters)
     scales = misfit.scales(misfit.deviations(solution.predicted, parameters))
@@ -159,15 +140,10 @@ def uncertainty(
 
 
 class Combination(NamedTuple):
-    """Identifiable product of powers of parameters.
+    """Identifiable product of powers of parameters."""
 
-    Attributes:
-        exponents: exponents by key.
-        standard_error: relative standard error of the product.
-    """
-
-    exponents: dict[str, float]
-    standard_error: float
+    exponents: dict[str, float]  # by key
+    standard_error: float  # relative
 
     def __str__(self) -> str:
         text = ""
@@ -179,17 +155,11 @@ class Combination(NamedTuple):
 
 
 class UnidentifiedGroup(NamedTuple):
-    """Parameters that are not identifiable one by one.
+    """Parameters that are not identifiable one by one."""
 
-    Attributes:
-        parameters: keys of the parameters.
-        known: identifiable combinations of them.
-        text: description, with a remedy.
-    """
-
-    parameters: list[str]
-    known: list[Combination]
-    text: str
+    parameters: list[str]  # keys
+    known: list[Combination]  # identifiable combinations of them
+    text: str  # description, with a remedy
 
     def as_json(self) -> dict[str, Any]:
         """Return JSON data."""
@@ -200,14 +170,7 @@ class UnidentifiedGroup(NamedTuple):
 def unidentified_groups(
     parameters: Sequence[Parameter], x: Array, uncertainties: Uncertainty, *, forces: bool
 ) -> list[UnidentifiedGroup]:
-    """Return the groups of unidentifiable parameters.
-
-    Args:
-        parameters: parameters of the fit.
-        x: their coordinates at the solution, shape (n,).
-        uncertainties: uncertainty of the solution.
-        forces: whether forces were measured; if not, measuring them is a remedy.
-    """
+    """Return the groups of unidentifiable parameters; `forces`: whether forces were measured, which is a remedy."""
     from scipy.sparse.csgraph import connected_components
 
     directions, members = uncertainties.unidentified_directions, np.flatnonzero(uncertainties.unidentified)

@@ -45,22 +45,14 @@ GROUPS = {
 
 @dataclass(frozen=True)
 class Grid:
-    """Cells of a table.
+    """Cells of a table."""
 
-    Attributes:
-        name: name of the file.
-        sheet: name of the sheet of a workbook, empty for a text.
-        rows: cells of every row, without empty ones at the end.
-        separator: key of `SEPARATORS`, empty for a workbook.
-        counts: number of cells of every row of a text, including empty ones at the end.
-        merged: (first row, last row, column) of cells that are merged with their right neighbours.
-    """
-
-    name: str
-    sheet: str
-    rows: list[Row]
-    separator: str = ""
-    counts: Sequence[int] = ()
+    name: str  # of the file
+    sheet: str  # of a workbook, empty for a text
+    rows: list[Row]  # cells, without empty ones at the end of a row
+    separator: str = ""  # key of `SEPARATORS`, empty for a workbook
+    counts: Sequence[int] = ()  # number of cells of every row of a text, including empty ones at the end
+    # (first row, last row, column) of cells that are merged with their right neighbours.
     merged: list[tuple[int, int, int]] = field(default_factory=list)
 
     @property
@@ -69,12 +61,7 @@ class Grid:
         return f"{self.name}: {self.sheet}" if self.sheet else self.name
 
     def place(self, row: int, column: int = 0) -> str:
-        """Return the line of a text, as FILE:LINE, or the cell of a workbook, as FILE: SHEET!A1, for messages.
-
-        Args:
-            row: index of the row, from 0.
-            column: index of the column, from 0.
-        """
+        """Return the line of a text, as FILE:LINE, or the cell of a workbook, as FILE: SHEET!A1, for messages."""
         if not self.sheet:
             return f"{self.name}:{row + 1}"
         letters = ""
@@ -93,15 +80,7 @@ class Grid:
         return not is_comment and any(character.isalnum() for cell in cells for character in cell)
 
     def require_width(self, row: int, header: int) -> None:
-        """Check that a row of a text is not longer than its header.
-
-        Args:
-            row: index of the row.
-            header: index of the header.
-
-        Raises:
-            SceneError: when the row is longer.
-        """
+        """Raise a SceneError if a row of a text is longer than its header."""
         cells, names = self.rows[row], self.rows[header]
         if not self.sheet and len(cells) > len(names):
             is_decimal = self.separator == "commas"
@@ -110,15 +89,9 @@ class Grid:
             raise SceneError([f"{self.place(row)}: {fault}; {remedy}"])
 
     def numbers(self, header: int, cells: Iterable[tuple[int, int]], remedy: str) -> list[tuple[float, int]]:
-        """Return the number of every cell, with the power of its last digit, as `parse_number` does.
+        """Return the number of every cell (row, column), with the power of its last digit, as `parse_number` does.
 
-        Args:
-            header: index of the header, for messages.
-            cells: (row, column) of every cell.
-            remedy: end of the message about a cell that is not a number.
-
-        Raises:
-            SceneError: when a cell is not a number, or when decimal marks differ.
+        Raise a SceneError for a cell that is not a number, with the given remedy, or when decimal marks differ.
         """
         numbers, known_mark = [], ""
         for row, column in cells:
@@ -137,16 +110,7 @@ class Grid:
 
 
 def read_text(name: str, is_header: Callable[[Row], bool], expected: str) -> Grid:
-    """Return the cells of a text table.
-
-    Args:
-        name: path of the file.
-        is_header: whether a row is a header; the separator is one that splits a line into a header.
-        expected: description of a readable file, for messages.
-
-    Raises:
-        SceneError: when the file cannot be read, or is not a text.
-    """
+    """Return the cells of a text table; the separator is one that splits a line into a header."""
     rows, counts, separator, numbers_row, numbers = [], [], "", -1, dict[str, list[bool]]()
     data = read_bytes(name, expected)
     if (count := max(data.count(b"\n"), data.count(b"\r"))) > MAX_LINES:
@@ -172,8 +136,7 @@ def read_text(name: str, is_header: Callable[[Row], bool], expected: str) -> Gri
 def parse_number(cell: str) -> tuple[float, int] | None:
     """Parse a number; accept decimal commas, grouped thousands, and U+2212 as minus.
 
-    Returns:
-        Number, and power of ten of its last digit; None for a cell that is not a number.
+    Return the number, and the power of ten of its last digit, or None for a cell that is not a number.
     """
     text = cell.replace("\N{MINUS SIGN}", "-")
     if (mark := decimal_mark(text)) and GROUPS[mark].fullmatch(text):

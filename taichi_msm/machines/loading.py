@@ -48,31 +48,19 @@ FORCE_ACCURACY = 1e-5
 
 @dataclass(frozen=True, eq=False)
 class Approach:
-    """Straight path of a tool, from first contact with the sheet at rest, or from the rest of a clamp.
+    """Straight path of a tool, from first contact with the sheet at rest, or from the rest of a clamp."""
 
-    Attributes:
-        probe: index of the tool in the scene.
-        start: centre of the tip at first contact [m], shape (3,); 0, the displacement at rest, for a clamp.
-        direction: unit vector of the motion, shape (3,).
-        tip_height: height of the centre above the lowest point of the tip [m].
-        size: height and width of the sheet [m].
-        is_clamp: whether the tool is a clamp.
-    """
-
-    probe: int
-    start: Array
-    direction: Array
-    tip_height: float
-    size: tuple[float, float]
+    probe: int  # index of the tool in the scene
+    start: Array  # centre of the tip at first contact [m], shape (3,); 0, the displacement at rest, for a clamp
+    direction: Array  # unit vector of the motion, shape (3,)
+    tip_height: float  # height of the centre above the lowest point of the tip [m]
+    size: tuple[float, float]  # height and width of the sheet [m]
     is_clamp: bool
 
     def place(self, data: dict[str, Any], travel: Array, rate: float) -> dict[str, Any]:
         """Return a scene's data with the path, duration and frame rate of a test.
 
-        Args:
-            data: data of a scene.
-            travel: distance from `start` at every frame [m], shape (frames,).
-            rate: frames per second.
+        `travel`: distance from `start` at every frame [m], shape (frames,).
         """
         (height, width), time = self.size, np.arange(len(travel)) / rate
         x, y, z = (self.start + travel[:, None] * self.direction).T
@@ -128,36 +116,22 @@ def _first_contact(tool: Tool, direction: Array, scene: Scene) -> Array | None:
 
 @dataclass(frozen=True, eq=False)
 class Loading:
-    """Machine test, sampled at the frames of a scene.
+    """Machine test, sampled at the frames of a scene."""
 
-    Attributes:
-        test: the test, without force offset, and with times from 0.
-        rate: frames per second of the scene.
-        time: time of the test at every frame [s], shape (frames,).
-        depth: depth at every frame, as in the table [m], shape (frames,).
-        force: measured force along the tool's direction at every frame [N], shape (frames,).
-        sigma: standard deviation of the force at every frame [N], shape (frames,).
-        sigma_freedom: degrees of freedom of the estimate of sigma.
-        information: number of independent forces per frame, shape (frames,): 1, less for frames that share rows, 0 for
-            a frame between rows and for a first frame in contact.
-        offset: force of the table without contact [N], subtracted from all forces.
-        noise: standard deviation of the force in the first rows [N].
-        contact: depth of contact, as in the table [m].
-        finds_contact: whether the depth of contact is estimated from the noise.
-    """
-
-    test: MachineTest
-    rate: float
-    time: Array
-    depth: Array
-    force: Array
-    sigma: Array
-    sigma_freedom: float
+    test: MachineTest  # without force offset, and with times from 0
+    rate: float  # frames per second of the scene
+    time: Array  # of every frame [s], shape (frames,)
+    depth: Array  # depth at every frame, as in the table [m], shape (frames,)
+    force: Array  # measured force along the tool's direction at every frame [N], shape (frames,)
+    sigma: Array  # standard deviation of the force at every frame [N], shape (frames,)
+    sigma_freedom: float  # degrees of freedom of the estimate of sigma
+    # Number of independent forces per frame, shape (frames,): 1, less for frames that share rows, 0 for a frame between
+    # rows and for a first frame in contact.
     information: Array
-    offset: float
-    noise: float
-    contact: float
-    finds_contact: bool
+    offset: float  # force of the table without contact [N], subtracted from all forces
+    noise: float  # standard deviation of the force in the first rows [N]
+    contact: float  # depth of contact, as in the table [m]
+    finds_contact: bool  # whether the depth of contact is estimated from the noise
 
     @property
     def peak(self) -> float:
@@ -181,17 +155,9 @@ def build_loading(
 ) -> Loading:
     """Return a machine test sampled at frames, with estimated noise and depth of contact.
 
-    Args:
-        test: the test.
-        scene: scene of the tool and the tissue.
-        rate: frames per second; by default 10, or fewer for a long test; of equilibria without relaxation, frames are
-            then equidistant in depth.
-        contact: depth of contact, as in the table [m]; by default estimated from the forces, for a clamp the first
-            depth.
-        is_clamp: whether the tool is a clamp.
-
-    Raises:
-        SceneError: when the force does not rise with the depth, or the depth of contact is outside the table.
+    The default rate is 10 frames per second, or less for a long test; of equilibria without relaxation, frames are then
+    equidistant in depth. The default depth of contact [m of the table] is estimated from the forces, for a clamp it is
+    the first depth.
     """
     first = test.force[: _count_noise_rows(test)]
     offset = float(np.median(first))
@@ -226,15 +192,7 @@ def build_loading(
 
 
 def require_plausible_travel(loading: Loading, scene: Scene) -> None:
-    """Require that the tool travels less than ten sizes of the sheet, as it does in another unit.
-
-    Args:
-        loading: the test.
-        scene: supplies the size of the sheet.
-
-    Raises:
-        SceneError: when the tool travels farther.
-    """
+    """Raise a SceneError if the tool travels farther than ten sizes of the sheet, as it does in another unit."""
     travel, side = float(loading.travel().max()), max(scene.sheet.size)
     if travel > 10 * side:
         fault = f"depth: the tool travels {travel:.4g} m, and the sheet is {side:g} m long"
@@ -262,10 +220,6 @@ def late_contact_note(loading: Loading, key: str) -> str | None:
     """Return a warning if the force rises already in the first rows, or None.
 
     The noise of these rows is then too large, and the contact is found too late.
-
-    Args:
-        loading: the test.
-        key: key of its depth of contact, for the remedy.
     """
     from scipy.stats import kendalltau
 
@@ -283,21 +237,13 @@ def late_contact_note(loading: Loading, key: str) -> str | None:
 
 
 class _Frames(NamedTuple):
-    """Means over the rows of every frame, each of shape (frames,).
+    """Means over the rows of every frame, each of shape (frames,)."""
 
-    Attributes:
-        time: time [s].
-        depth: depth [m].
-        force: force [N].
-        rows: number of rows, with those of several frames in equal parts.
-        information: `rows` as a share of all rows of the frame; 0 without rows.
-    """
-
-    time: Array
-    depth: Array
-    force: Array
-    rows: Array
-    information: Array
+    time: Array  # [s]
+    depth: Array  # [m]
+    force: Array  # [N]
+    rows: Array  # number of rows, with those of several frames in equal parts
+    information: Array  # `rows` as a share of all rows of the frame; 0 without rows
 
 
 def _sample_in_depth(test: MachineTest, noise: float, contact: float, *, finds_contact: bool) -> tuple[_Frames, float]:

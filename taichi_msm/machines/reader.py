@@ -69,23 +69,14 @@ VALUE_START = re.compile(r"[+\-\N{MINUS SIGN}]?[.,]?\d|[+-]?(nan|inf)|[#=]", re.
 
 @dataclass(frozen=True)
 class MachineTest:
-    """Test of a testing machine.
+    """Test of a testing machine."""
 
-    Attributes:
-        name: name of the file, with the sheet of a workbook, and the block if there are several.
-        time: increasing times [s], shape (n,).
-        depth: depths or elongations [m], shape (n,), signed so that the largest magnitude is positive.
-        force: forces [N], shape (n,), signed likewise.
-        digit: resolution of the forces: their last digit in the file [N].
-        notes: warnings about choices of the reader, and about the test.
-    """
-
-    name: str
-    time: Array
-    depth: Array
-    force: Array
-    digit: float
-    notes: tuple[str, ...] = ()
+    name: str  # name of the file, with the sheet of a workbook, and the block if there are several
+    time: Array  # increasing times [s], shape (n,)
+    depth: Array  # depths or elongations [m], shape (n,), signed so that the largest magnitude is positive
+    force: Array  # forces [N], shape (n,), signed likewise
+    digit: float  # resolution of the forces: their last digit in the file [N]
+    notes: tuple[str, ...] = ()  # warnings about choices of the reader, and about the test
 
 
 @dataclass(frozen=True)
@@ -110,16 +101,10 @@ class _Column:
 def read_machine_test(
     path: str | Path, columns: Sequence[str] = (), sheet: str | None = None, block: int | None = None
 ) -> MachineTest:
-    """Return the machine test of a table.
+    """Return the machine test of a table, a workbook (.xlsx), or a text with any other suffix.
 
-    Args:
-        path: path of a workbook (.xlsx), or of a text with any other suffix.
-        columns: selected columns, such as "depth=Traverse, mm"; the unit of the file by default.
-        sheet: sheet of a workbook; by default the only one with a table.
-        block: number of the block, from 1; by default the only one.
-
-    Raises:
-        SceneError: when the file has no such table, or several without a selection.
+    Selected columns are such as "depth=Traverse, mm", by default with the unit of the file; blocks are counted from 1.
+    A single sheet or block with a table needs no selection.
     """
     name, chosen = str(path), _parse_choices(columns)
     if name.lower().endswith(WORKBOOK_SUFFIX):
@@ -144,16 +129,7 @@ def read_machine_test(
 
 
 def cut_window(test: MachineTest, start: float, end: float) -> MachineTest:
-    """Return the rows of a test between two times, with unchanged times.
-
-    Args:
-        test: the test.
-        start: first time, as in the table [s].
-        end: last time, as in the table [s].
-
-    Raises:
-        SceneError: when too few rows remain.
-    """
+    """Return the rows of a test between two times [s of the table], with unchanged times; require `MIN_ROWS`."""
     kept = (test.time >= start) & (test.time <= end)
     if (count := int(kept.sum())) < MIN_ROWS:
         extent = f"the table is from {test.time[0]:g} to {test.time[-1]:g} s"
@@ -248,7 +224,6 @@ def _is_header(row: Row, chosen: dict[str, str]) -> bool:
 
 
 def _find_candidates(row: Row, chosen: dict[str, str]) -> dict[str, list[int]]:
-    """Return the candidate columns of every quantity."""
     candidates = {}
     for quantity, title in chosen.items():
         # Columns of the whole title, or else of its name without the unit.
@@ -307,7 +282,6 @@ def _split_choice(title: str, quantity: str) -> tuple[str, float | None]:
 
 
 def _read_block(grid: Grid, block: _Block, chosen: dict[str, str]) -> MachineTest:
-    """Read the numbers of a block."""
     columns, notes = _select_columns(grid, block, chosen)
     rows = list(_rows_of_numbers(grid, block, columns))
     if len(rows) < MIN_ROWS:
@@ -409,8 +383,7 @@ def _describe_merged(grid: Grid, row: int, column: int) -> str:
 def _rows_of_numbers(grid: Grid, block: _Block, columns: list[_Column]) -> Iterator[int]:
     """Yield the indices of the rows of numbers of a block, up to the first row of text.
 
-    Raises:
-        SceneError: when a row has too few or too many cells, or numbers follow a row of text.
+    Raise a SceneError when a row has too few or too many cells, or numbers follow a row of text.
     """
     indices, text, names = [column.index for column in columns], None, grid.rows[block.header]
     for n in block.rows:

@@ -49,15 +49,7 @@ class LimitError(Exception):
 
 
 def read_workbook(name: str, expected: str) -> dict[str, Grid]:
-    """Return the worksheets of a workbook by name.
-
-    Args:
-        name: path of the file.
-        expected: description of a readable file, for messages.
-
-    Raises:
-        SceneError: when the file cannot be read, or is not a workbook.
-    """
+    """Return the worksheets of a workbook by name; `expected` describes a readable file, for messages."""
     data = read_bytes(name, expected)
     try:
         with zipfile.ZipFile(io.BytesIO(data)) as archive:

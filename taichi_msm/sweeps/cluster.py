@@ -36,37 +36,24 @@ MAX_WAIT_S = 10
 
 
 class Inputs(WorkerPlugin):  # type: ignore[misc]  # that package has no types
-    """Worker plugin with the inputs that all runs of a sweep have in common.
-
-    Args:
-        sweep: sweep with the scene and the files of the runs.
-        directory: directory of the sweep, accessible to all workers.
-
-    Attributes:
-        versions: required versions of this package and its libraries, by name.
-        error: why the worker cannot execute runs; empty if it can.
-        copies: paths of local copies of the files, by path of the file.
-    """
+    """Worker plugin with the inputs that all runs of a sweep have in common; all workers must access the directory."""
 
     def __init__(self, sweep: Sweep, directory: Path) -> None:
         scene = sweep.scene
         # Absolute, as workers have other current directories.
         self.scene, self.directory = scene._replace(folder=scene.folder.absolute()), directory.absolute()
         self.home = Path.cwd()
+        # Required versions of this package and its libraries, by name.
         self.versions = result_versions(versions(), "cpu")
         self._digests = {str(Path(path).absolute()): digest for path, digest in sweep.files.items()}
         self._contents = {digest: Path(path).read_bytes() for path, digest in self._digests.items()}
-        self.error = ""
-        self.copies: dict[str, Path] = {}
+        self.error = ""  # reason why the worker cannot execute runs
+        self.copies: dict[str, Path] = {}  # local copies, by path of the file
         self._folder = Path()
         self._ended = False
 
     def setup(self, worker: Any) -> None:
-        """Write the files to a temporary folder of the worker.
-
-        Raises:
-            ExecutorError: when the worker cannot execute runs.
-        """
+        """Write the files to a temporary folder of the worker; raise an ExecutorError if it cannot execute runs."""
         self.error = self._check(worker)
         if self.error:
             raise ExecutorError(self.error)
@@ -107,9 +94,7 @@ class Inputs(WorkerPlugin):  # type: ignore[misc]  # that package has no types
 class Cluster(ClientExecutor):  # type: ignore[misc]
     """Executor on the workers of a scheduler; sends only number, overrides and directory of a run.
 
-    Args:
-        client: connection to the scheduler.
-        name: name of the plugin `Inputs` on the scheduler.
+    The name is that of the plugin `Inputs` on the scheduler.
     """
 
     def __init__(self, client: Any, name: str) -> None:
@@ -117,17 +102,9 @@ class Cluster(ClientExecutor):  # type: ignore[misc]
         self._name = name
 
     def submit(self, function: Callable[..., Any], /, *arguments: Any) -> Future[Any]:
-        """Schedule a call in an idle worker.
+        """Schedule a call of an importable function in an idle worker; raise a BrokenExecutor without connection.
 
-        Args:
-            function: an importable function; `execute_run` gets the scene and its files from the plugin.
-            arguments: picklable arguments of the function.
-
-        Returns:
-            Future of the result.
-
-        Raises:
-            BrokenExecutor: when the connection to the scheduler is lost.
+        The arguments are picklable; `execute_run` gets the scene and its files from the plugin.
         """
         call: tuple[Any, ...] = (_call, self._name, function, *arguments)
         if function is execute_run:
@@ -170,20 +147,10 @@ def _inputs(name: str) -> Inputs:
 def cluster_connection(
     address: str, sweep: Sweep, directory: Path, progress: StageProgressCallback
 ) -> Iterator[Cluster]:
-    """Connect to a scheduler, and send the inputs of a sweep to its workers; a context manager.
+    """Connect to a scheduler, such as tcp://10.0.0.1:8786, and send the inputs of a sweep to its workers.
 
-    Args:
-        address: address of the scheduler, such as tcp://10.0.0.1:8786.
-        sweep: sweep with the scene and the files of the runs.
-        directory: directory of the sweep.
-        progress: called while waiting for the first worker.
-
-    Yields:
-        An executor on the workers.
-
-    Raises:
-        ExecutorError: when no scheduler answers, or a worker cannot execute runs.
-        LostExecutorError: in place of an error of the block, when the connection is lost.
+    The context manager yields an executor. Raise an ExecutorError when no scheduler answers, or a worker cannot execute
+    runs, and a LostExecutorError in place of an error of the block, when the connection is lost.
     """
     with silence_logging_cmgr(logging.CRITICAL):
         client = _client(address)

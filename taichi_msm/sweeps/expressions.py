@@ -50,17 +50,10 @@ class ExpressionError(ValueError):
 
 
 def evaluate(text: str, variables: Mapping[str, float]) -> float:
-    """Evaluate an expression.
+    """Evaluate an expression that begins with =; an int if it has only ints and no division.
 
-    Args:
-        text: expression that begins with =.
-        variables: values by name; NaN raises only the errors that do not depend on values.
-
-    Returns:
-        The value; an int if the expression has only ints and no division.
-
-    Raises:
-        ExpressionError: when the expression is invalid, or its value is not defined or too large.
+    Raise an ExpressionError when it is invalid, or its value is not defined or too large; NaN as the value of variables
+    raises only errors that do not depend on values.
     """
     reason = f"{len(text)} characters; take at most {MAX_LENGTH}"
     if len(text) <= MAX_LENGTH:
@@ -105,13 +98,7 @@ def _value(node: ast.expr, names: Mapping[str, float]) -> float:
 
 
 def replace_expressions(value: Any, change: Callable[[Key, str], Any], path: Key = ()) -> Any:
-    """Return a copy of a value of `set` with its expressions replaced.
-
-    Args:
-        value: plain data.
-        change: function from the key and the text of an expression to its replacement.
-        path: key of the value.
-    """
+    """Return a copy of a value of `set`, with expressions replaced by `change` of their key and text."""
     if isinstance(value, str):
         return change(path, value) if value.startswith("=") else value
     if isinstance(value, dict):

@@ -56,12 +56,7 @@ class PlotData(NamedTuple):
 
 
 def plot(data: PlotData, file: BinaryIO) -> None:
-    """Plot sweep.png: a panel for each result and each of the most sensitive parameters.
-
-    Args:
-        data: parameters and results of the plotted runs.
-        file: receives the PNG.
-    """
+    """Plot sweep.png: a panel for each result and each of the most sensitive parameters."""
     from matplotlib import style
 
     with style.context(STYLE, after_reset=True), warnings.catch_warnings():
@@ -175,8 +170,6 @@ def _tick_label(number: float, _: float) -> str:
     return f"{float(digits):g}e{int(exponent)}"
 
 
-WITHOUT_PICTURES = "contact.jpg needs pictures of the runs; take set: {output: [png]}, or trajectory, and an image"
-
 GAP_PX, LINE_HEIGHT_PX, MAX_CAPTION_LINES = 20, 23, 8
 
 
@@ -191,22 +184,17 @@ class Tile(NamedTuple):
 def write_contact_sheet(
     state: SweepState, written: list[str], executor: Executor, progress: StageProgressCallback
 ) -> list[str]:
-    """Write contact.jpg if a run has a picture.
+    """Write contact.jpg if a run has a picture, and append it to the written reports; return warnings.
 
-    Args:
-        state: the finished sweep.
-        written: names of the written reports; contact.jpg is appended.
-        executor: draws the frames of runs without pictures.
-        progress: called with the stage, and the drawn and total number of frames.
-
-    Returns:
-        Warnings.
+    The executor draws the frames of runs without pictures.
     """
     runs = spread(len(state.outcomes), 36)
     complete = [run for run in runs if state.outcomes[run].status == "complete"]
     frames, errors = _largest_frames({run: state.run_directory(run) for run in complete}, executor, progress)
     if not frames:
-        reason = WITHOUT_PICTURES if complete else "contact.jpg needs a complete run"
+        reason = "contact.jpg needs a complete run"
+        if complete:
+            reason = "contact.jpg needs pictures of the runs; take set: {output: [png]}, or trajectory, and an image"
         return [f"no contact.jpg: {errors[0]}" if errors else reason]
     names = abbreviate_keys(state.sweep.keys)
     tiles = []
@@ -269,18 +257,7 @@ def _largest_frames(
 
 
 def read_gif_frame(path: Path, time: float) -> Image.Image:
-    """Read a picture of an animated GIF.
-
-    Args:
-        path: the GIF.
-        time: time from its start [s].
-
-    Returns:
-        The RGB picture at the time; after the end, the last one.
-
-    Raises:
-        FilesError: when the GIF cannot be read or decoded.
-    """
+    """Read the RGB picture of an animated GIF at a time from its start [s]; after the end, the last one."""
     with reading(path), Image.open(path, formats=["GIF"]) as film:
         for number in range(film.n_frames):
             film.seek(number)
@@ -382,12 +359,7 @@ class VariedParameter(NamedTuple):
 
 
 def varied_parameters(state: SweepState, runs: Sequence[int]) -> list[VariedParameter]:
-    """Return the parameters that differ between runs, in the order of the keys.
-
-    Args:
-        state: the finished sweep.
-        runs: numbers of the compared runs.
-    """
+    """Return the parameters that differ between runs, in the order of the keys."""
     names = abbreviate_keys(state.sweep.keys)
     columns = zip(*(state.values[run] for run in runs), strict=True)
     return [
@@ -401,12 +373,7 @@ def varied_parameters(state: SweepState, runs: Sequence[int]) -> list[VariedPara
 def varied_results(state: SweepState, runs: Sequence[int]) -> dict[str, NDArray[np.float64]]:
     """Return the columns of the table that differ between runs, by name.
 
-    Args:
-        state: the finished sweep.
-        runs: numbers of the compared runs.
-
-    Returns:
-        Columns, shape (runs,); NaN where a run is incomplete or lacks the result.
+    Columns have shape (runs,), NaN where a run is incomplete or lacks the result.
     """
     complete = [state.outcomes[run].status == "complete" for run in runs]
     columns = {}
@@ -458,17 +425,9 @@ class SensitivityIndex(NamedTuple):
 def estimate_sensitivity(
     parameters: Sequence[VariedParameter], results: Mapping[str, NDArray[np.float64]]
 ) -> list[SensitivityIndex]:
-    """Estimate the first-order sensitivity of every result to every parameter.
+    """Estimate the first-order sensitivity to every parameter, of every result that at least 64 runs have.
 
-    Args:
-        parameters: varied parameters.
-        results: results by name, shape (runs,); NaN where a run lacks the result.
-
-    Returns:
-        An index of each parameter for each result that at least 64 runs have.
-
-    Raises:
-        ImportError: when SALib is not installed.
+    Results have shape (runs,), NaN where a run lacks the result. An ImportError shows that SALib is not installed.
     """
     indices = []
     for name, column in results.items():
@@ -484,14 +443,9 @@ def estimate_sensitivity(
 
 
 def first_order_index(parameter: NDArray[np.float64], result: NDArray[np.float64]) -> tuple[float, float]:
-    """Estimate the first-order index of a parameter by RBD-FAST, as the mean over shuffles.
+    """Estimate the first-order index of a parameter by RBD-FAST, as the mean over shuffles; both of shape (runs,).
 
-    Args:
-        parameter: values of the parameter, shape (runs,).
-        result: values of the result, shape (runs,).
-
-    Returns:
-        The index, and the half-width of its 95 % interval.
+    Return the index, and the half-width of its 95 % interval.
     """
     from SALib.analyze import rbd_fast
 

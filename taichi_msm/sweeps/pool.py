@@ -31,11 +31,7 @@ class DiedError(MsmError):
 
 
 class Pool(Executor):
-    """Executor that starts processes on demand.
-
-    Args:
-        workers: largest number of processes.
-    """
+    """Executor that starts processes on demand, at most `workers`."""
 
     def __init__(self, workers: int) -> None:
         self._threads = ThreadPoolExecutor(workers)
@@ -43,25 +39,14 @@ class Pool(Executor):
         self._lock, self._closed = Lock(), False
 
     def submit(self, function: Callable[..., Any], /, *arguments: Any, **named: Any) -> Future[Any]:
-        """Schedule a call in an idle process.
+        """Schedule a call of an importable function in an idle process; arguments and result are picklable.
 
-        Args:
-            function: an importable function.
-            arguments: picklable arguments of the function.
-            named: picklable named arguments of the function.
-
-        Returns:
-            Future of the result, which must be picklable; it raises a `DiedError` if the process ends before.
+        The future raises a `DiedError` if the process ends before the call.
         """
         return self._threads.submit(self._call, function, arguments, named)
 
     def shutdown(self, wait: bool = True, *, cancel_futures: bool = False) -> None:
-        """End every process after its call.
-
-        Args:
-            wait: whether to wait for running calls.
-            cancel_futures: whether to cancel pending calls, and kill the processes at once.
-        """
+        """End every process after its call; `cancel_futures` also cancels pending calls, and kills the processes."""
         self._threads.shutdown(wait=False, cancel_futures=cancel_futures)
         if cancel_futures:
             with self._lock:

@@ -117,19 +117,10 @@ class SweepState:
 
 
 def begin_sweep(sweep: Sweep, directory: Path, shard: tuple[int, int] = (1, 1)) -> SweepState:
-    """Begin or resume a sweep in a directory.
+    """Begin or resume a shard (I, N), 1 <= I <= N, of a sweep in a directory, with its finished and missing runs.
 
-    Args:
-        sweep: the sweep.
-        directory: directory of the sweep, created if missing.
-        shard: shard I of N as (I, N), 1 <= I <= N.
-
-    Returns:
-        The sweep, with the finished and the missing runs of the shard.
-
-    Raises:
-        SceneError: when the directory contains another sweep, or runs of other versions, whose results may differ.
-        FilesError: when the directory cannot be read or written, has foreign files, or a damaged record.
+    Raise a SceneError when the directory contains another sweep, or runs of other versions, whose results may differ; a
+    FilesError when it cannot be read or written, has foreign files, or a damaged record.
     """
     state = SweepState(directory, sweep, _register(sweep, directory), [])
     part, parts = shard
@@ -147,12 +138,7 @@ def begin_sweep(sweep: Sweep, directory: Path, shard: tuple[int, int] = (1, 1)) 
 def read_outcome(task: RunTask, sweep: Sweep) -> Outcome | None:
     """Read the outcome of a finished run.
 
-    Args:
-        task: run, with the overrides that its record must have.
-        sweep: sweep, with the files that the record may have.
-
-    Returns:
-        The outcome; None if the record is missing, damaged, of an interrupted run or of another task.
+    Return None if the record is missing, damaged, of an interrupted run, or of other overrides or files.
     """
     # A run with a damaged record is repeated.
     with suppress(OSError, ValueError, KeyError, TypeError, AttributeError, RecursionError):
@@ -166,14 +152,9 @@ def read_outcome(task: RunTask, sweep: Sweep) -> Outcome | None:
 
 
 def lock_reports(directory: Path, pause: errors.Pause) -> BinaryIO:
-    """Lock the reports of a sweep.
+    """Return the locked reports of a sweep; closing the file releases the lock.
 
-    Args:
-        directory: directory of the sweep.
-        pause: called repeatedly while another command holds the lock; an exception from it ends the wait.
-
-    Returns:
-        The locked file, which releases the lock when closed.
+    `pause` is called while another command holds the lock; an exception from it ends the wait.
     """
     while True:
         try:
@@ -190,18 +171,8 @@ POLL_INTERVAL_S = 0.1
 def run_missing(state: SweepState, executor: Executor, progress: StageProgressCallback) -> Iterator[Outcome]:
     """Execute the missing runs of a sweep, and yield their outcomes in order of completion.
 
-    A run whose process of the `Pool` died is executed once more.
-
-    Args:
-        state: the sweep; receives the outcomes.
-        executor: executor of the runs.
-        progress: called several times a second; an exception from it ends the sweep.
-
-    Yields:
-        The outcome of each run.
-
-    Raises:
-        LostExecutorError: when the executor accepts no more runs.
+    A run whose process of the `Pool` died is executed once more. The state receives the outcomes; an exception from
+    `progress` ends the sweep. A LostExecutorError is raised when the executor accepts no more runs.
     """
     done: SimpleQueue[Future[Outcome]] = SimpleQueue()
     pending: dict[Future[Outcome], RunTask] = {}
@@ -264,14 +235,9 @@ class RunTask(NamedTuple):
 
 
 def execute_run(task: RunTask, progress: StageProgressCallback = lambda stage, done, total: None) -> Outcome:
-    """Run a scene with its overrides on one thread, as `run --set` does.
+    """Run a scene with its overrides on one thread, as `run --set` does; return the outcome, also of a failed run.
 
-    Args:
-        task: the run.
-        progress: called several times a second; may raise KeyboardInterrupt, as in `runs.run.run`.
-
-    Returns:
-        The outcome, also of a failed run; nothing is raised but exceptions from `progress`.
+    Nothing is raised but exceptions of `progress`, which may be KeyboardInterrupt, as in `runs.run.run`.
     """
     os.chdir(task.home)
     status: Status
@@ -290,7 +256,6 @@ def execute_run(task: RunTask, progress: StageProgressCallback = lambda stage, d
 
 
 def _run_scene(task: RunTask, progress: StageProgressCallback) -> Mapping[str, Any]:
-    """Run the scene of a task; return the record."""
     plan = plan_file(task.scene, task.overrides)
     try:
         cost.require_disk(plan, task.directory)

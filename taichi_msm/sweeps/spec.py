@@ -135,12 +135,7 @@ class SweepSettings(Section):
 
 
 def spread(total: int, limit: int) -> list[int]:
-    """Return the numbers of evenly spaced runs.
-
-    Args:
-        total: number of runs.
-        limit: largest number of spaced runs.
-    """
+    """Return the numbers of at most `limit` evenly spaced runs."""
     count = min(total, limit)
     return [(2 * n + 1) * total // (2 * count) for n in range(count)]
 
@@ -166,10 +161,8 @@ class Sweep:
         """Compute the values of the variables and the varied keys for each run, in the order of `keys`.
 
         With `samples`, the runs are the first points of a scrambled Sobol sequence, which has a dimension for every
-        number and choice. Without, they are all combinations of the grids, of which the last key varies fastest.
-
-        Args:
-            limit: largest number of runs: the first points of the sequence, or evenly spaced combinations.
+        number and choice. Without, they are all combinations of the grids, of which the last key varies fastest. A
+        limit keeps the first points, or evenly spaced combinations.
 
         Source: Owen, "Randomly permuted (t,m,s)-nets and (t,s)-sequences", 1995; SciPy's `qmc.Sobol`.
         """
@@ -192,7 +185,6 @@ class Sweep:
         return [list(values) for values in zip(*columns, strict=True)]
 
     def _combination(self, run: int) -> list[Any]:
-        """Return the values of a run on the grids."""
         values = []
         for distribution in reversed(self.settings.distributions.values()):
             run, index = divmod(run, len(distribution.values))
@@ -258,11 +250,7 @@ class Sweep:
 
 
 def load_sweep(path: str | Path) -> Sweep:
-    """Read and check a sweep file.
-
-    Raises:
-        SceneError: with a line for each error of the file, in the order of the file.
-    """
+    """Read and check a sweep file; raise a SceneError with a line for each error, in the order of the file."""
     draft = scene_file.Draft(scene_file.read_file(str(path), scene_file.FileKind("sweep", "scene and vary")))
     if "sheet" in draft.data and not {"vary", "variables"} & draft.data.keys():
         raise SceneError([f"{path}:1:1: a scene; use `taichi-msm run`, or name it by `scene:` in a sweep file"])
@@ -274,18 +262,10 @@ def load_sweep(path: str | Path) -> Sweep:
 
 
 def make_sweep(scene: str | Path, settings: Mapping[str, Any]) -> Sweep:
-    """Build a sweep without a sweep file.
+    """Build a sweep without a sweep file; its paths are relative to the scene file.
 
-    Args:
-        scene: path of the scene file, the base of relative paths in `settings`.
-        settings: content of a sweep file, without `scene`.
-
-    Returns:
-        The sweep; its paths are relative to the scene file.
-
-    Raises:
-        ArgumentError: when a value cannot be represented in JSON.
-        SceneError: with a line for each error of the settings.
+    `settings` are the content of a sweep file, without `scene`. A value that JSON cannot represent raises an
+    ArgumentError.
     """
     try:
         data = json.loads(json.dumps({**settings, "scene": Path(scene).name}))

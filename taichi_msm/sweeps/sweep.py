@@ -109,20 +109,10 @@ def sweep(
 def open_executor(
     executor: Executor | str | None, workers: int, state: SweepState, progress: StageProgressCallback
 ) -> Iterator[Executor]:
-    """Open the executor of a sweep; its own processes end with the block.
+    """Open the executor of a sweep: an executor, the address of a dask scheduler, or None for a new `Pool`.
 
-    Args:
-        executor: an executor; the address of a dask scheduler; or None for a new `Pool`.
-        workers: number of processes of the pool.
-        state: the sweep.
-        progress: called while the first worker of a cluster is awaited.
-
-    Yields:
-        The opened executor.
-
-    Raises:
-        NotInstalledError: when dask.distributed is needed and not installed.
-        ExecutorError, LostExecutorError: as by `cluster.cluster_connection`.
+    Its own processes end with the block. Raise a NotInstalledError without dask.distributed, and the errors of
+    `cluster.cluster_connection`.
     """
     if isinstance(executor, str):
         try:
@@ -145,15 +135,9 @@ def open_executor(
 
 
 def finish_sweep(state: SweepState, executor: Executor, progress: StageProgressCallback) -> tuple[list[str], list[str]]:
-    """Write the table and the other reports of a sweep whose runs have ended.
+    """Write the reports of a sweep whose runs have ended; return the names of the written files, and warnings.
 
-    Args:
-        state: the sweep; receives the outcomes of runs that another command has finished.
-        executor: executor that draws the frames of runs without pictures.
-        progress: called while another command writes the reports, and while frames are drawn.
-
-    Returns:
-        Names of the written files, and warnings, of `tables.write_reports`.
+    The state receives the outcomes of runs that another command has finished.
     """
     directory, total = state.directory, len(state.values)
     with writing(directory), lock_reports(directory, lambda: progress("runs", total, total)):

@@ -32,22 +32,13 @@ from taichi_msm.system.files import read_regular
 from taichi_msm.system.process import available_memory, available_threads
 from taichi_msm.version import commit
 
-WITHOUT_MATPLOTLIB = "sweep.png needs matplotlib: pip install matplotlib"
-WITHOUT_SALIB = "sensitivity.csv needs SALib: pip install SALib"
-
 
 def write_reports(
     state: SweepState, executor: Executor, progress: StageProgressCallback
 ) -> tuple[list[str], list[str]]:
     """Write the reports of a sweep, each atomically, and remove outdated ones.
 
-    Args:
-        state: the finished sweep.
-        executor: executor that draws the frames of runs without pictures.
-        progress: called with the stage, and the drawn and total number of frames.
-
-    Returns:
-        Names of the written files; and warnings, such as the failure of a report other than the table.
+    Return the names of the written files, and warnings, such as the failure of a report other than the table.
     """
     writers: dict[str, Callable[[SweepState, list[str]], list[str]]] = {
         "table.parquet": write_parquet,
@@ -81,14 +72,14 @@ def _write_plots(state: SweepState, written: list[str]) -> list[str]:
     try:
         indices = plots.estimate_sensitivity(varied, columns)
     except ImportError:
-        notes.append(WITHOUT_SALIB)
+        notes.append("sensitivity.csv needs SALib: pip install SALib")
     if indices:
         _write_csv(state.directory / "sensitivity.csv", [indices[0]._fields, *indices])
         written.append("sensitivity.csv")
     try:
         import matplotlib  # noqa: F401
     except ImportError:
-        return [*notes, WITHOUT_MATPLOTLIB]
+        return [*notes, "sweep.png needs matplotlib: pip install matplotlib"]
     complete = count_statuses(state.outcomes)["complete"]
     subset = f", {len(runs)} of them shown" if len(runs) < len(state.outcomes) else ""
     title = f"{state.sweep.scene.name}: {complete} of {len(state.outcomes)} runs complete{subset}"
@@ -114,15 +105,7 @@ def format_cell(value: Any) -> str:
 
 
 def write_parquet(state: SweepState, written: list[str]) -> list[str]:
-    """Write table.parquet if pyarrow is installed.
-
-    Args:
-        state: the finished sweep.
-        written: names of the written reports; table.parquet is appended.
-
-    Returns:
-        No warnings.
-    """
+    """Write table.parquet if pyarrow is installed, and append it to the written reports; return no warnings."""
     try:
         import pyarrow
         from pyarrow import parquet
@@ -145,7 +128,6 @@ def write_parquet(state: SweepState, written: list[str]) -> list[str]:
 
 
 def _columns(state: SweepState) -> dict[str, list[Any]]:
-    """Return the columns of the table by name."""
     values = map(list, zip(*state.values, strict=True))
     runs = [outcome.run for outcome in state.outcomes]
     return {"run": runs, **dict(zip(state.sweep.keys, values, strict=True)), **state.columns()}
@@ -165,15 +147,7 @@ def csv_line(row: Iterable[Any]) -> str:
 
 
 def write_dataset(state: SweepState, written: list[str]) -> list[str]:
-    """Write dataset.json, with one line for each complete run.
-
-    Args:
-        state: the finished sweep.
-        written: names of the written reports; dataset.json is appended.
-
-    Returns:
-        No warnings.
-    """
+    """Write dataset.json, with a line for each complete run, and append it to the written reports; no warnings."""
     sweep, complete = state.sweep, [outcome.run for outcome in state.outcomes if outcome.status == "complete"]
     common = _output_format(state.run_directory(complete[0])) if complete else {}
     settings = sweep.settings
@@ -204,10 +178,6 @@ def assign_splits(runs: int, seed: int) -> list[str]:
 
     In the order of the SHA-256 of "SEED RUN", the first tenth of the runs is the test split, and the second tenth the
     validation split. So the split of a run depends only on the seed, its number and the number of runs.
-
-    Args:
-        runs: number of runs.
-        seed: seed of the sweep.
     """
     order = sorted(range(runs), key=lambda run: hashlib.sha256(f"{seed} {run}".encode()).digest())
     tenth = (runs + 5) // 10
@@ -234,13 +204,7 @@ def _json(value: Any) -> bytes:
 
 
 def cost_line(runs: int, expected: SweepCost, workers: WorkerCount | None) -> str:
-    """Return the estimated cost of runs as text.
-
-    Args:
-        runs: number of runs.
-        expected: cost of the runs.
-        workers: number of processes on this machine; None for a cluster.
-    """
+    """Return the estimated cost of runs as text; `workers` is None for a cluster."""
     location = "if they were run here"
     if workers is not None:
         processes = f"{workers.number} {'process' if workers.number == 1 else 'processes'}"
@@ -258,15 +222,7 @@ def summary_lines(
 ) -> list[str]:
     """Summarise a sweep: the number of runs with each status, an example of each failure, and the reports.
 
-    Args:
-        directory: directory of the sweep.
-        outcomes: outcomes of the sweep or shard.
-        shard: shard I of N as (I, N); None for the whole sweep.
-        files: names of the reports.
-        notes: warnings about the reports.
-
-    Returns:
-        Lines for the terminal.
+    The shard is (I, N), or None for the whole sweep; `files` and `notes` are those of `write_reports`.
     """
     part = f" of part {shard[0]} of {shard[1]}" if shard else ""
     counts = ", ".join(f"{number} {status}" for status, number in count_statuses(outcomes).items() if number)
@@ -358,13 +314,7 @@ def estimate_cost(sweep: Sweep) -> SweepCost:
 def choose_worker_count(expected: SweepCost, runs: int, requested: int | None = None) -> WorkerCount:
     """Choose the number of processes: one per core, limited by the free memory and the number of runs.
 
-    Args:
-        expected: cost of the sweep, with the memory of a process.
-        runs: number of runs.
-        requested: number that the user requests, which is not limited; None to choose.
-
-    Returns:
-        The number and its limits.
+    A requested number is not limited.
     """
     cores, memory_limit = available_threads(), available_memory() // expected.memory_bytes
     return WorkerCount(requested or max(1, min(cores, memory_limit, runs)), cores, memory_limit)
