@@ -14,7 +14,8 @@ PACKAGE = Path(__file__).parent.parent / "taichi_msm"
 LAYERS = [
     {"arithmetic", "errors", "plot_style", "version"},
     {"system"},
-    {"images", "lenses", "shapes"},
+    {"dual", "images"},
+    {"laws", "lenses", "shapes"},
     {"camera_files"},
     {"scene"},
     {"model"},

@@ -43,7 +43,7 @@ from taichi_msm.errors import DivergedError, Pause, ProgressCallback, SceneError
 from taichi_msm.model.plan import Plan
 from taichi_msm.model.sheet import MAX_CELL_ASPECT, Maps, cell_aspect_ratio, spacing
 from taichi_msm.model.tool_force import sum_probe_forces
-from taichi_msm.model.tools import overlap, touching_tools
+from taichi_msm.model.tools import overlap, solid_tools
 from taichi_msm.scene.scene import Scene
 from taichi_msm.scene.section import MAX_POINTS
 from taichi_msm.scene.sheet import Sheet
@@ -187,7 +187,7 @@ class MeshCompanion:
         self._contact = plan.has_contact
         self._overlap = overlap(plan.tools, plan.scene.time.duration) is not None
         cell = max(spacing(plan.scene.sheet))
-        self._narrow = any(tool.radius < MIN_RADIUS_CELLS * cell for tool in touching_tools(plan.tools))
+        self._narrow = any(tool.radius < MIN_RADIUS_CELLS * cell for tool in solid_tools(plan.tools).values())
         self._largest, self._shortest_spring = 0.0, 1.0
         self._second_run: MeshCompanion | None = None
 

@@ -30,7 +30,7 @@ from taichi_msm.errors import Pause, ProgressCallback
 from taichi_msm.model import tool_force
 from taichi_msm.model.plan import Plan
 from taichi_msm.model.tool_force import ProbeRecord
-from taichi_msm.model.tools import COARSE_TIP_PHRASE, MAX_POINTS_RATIO, Clamp, path_warnings
+from taichi_msm.model.tools import COARSE_TIP_PHRASE, MAX_POINTS_RATIO, path_warnings, solid_tools
 from taichi_msm.scene.section import MAX_POINTS
 from taichi_msm.scene.sheet import Foundation
 from taichi_msm.solver.dynamics import Dynamics
@@ -172,7 +172,7 @@ class RunErrorEstimator:
             known = known._replace(time_step=estimate)
         if self._mesh is not None:
             known = known._replace(mesh=self._mesh.estimate)
-            in_contact = self._max_force[[not isinstance(tool, Clamp) for tool in self._plan.tools]].all()
+            in_contact = self._max_force[list(solid_tools(self._plan.tools))].all()
             if not in_contact:
                 known = known._replace(mesh=MeshEstimate(math.inf, NO_CONTACT))
             elif self._plan.has_contact and known.time_step is not None and known.time_step.error > MAX_DIFFERENCE:

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from taichi_msm.model.sheet import Maps, Material, has_fixed_border, point_areas
 from taichi_msm.model.time_grid import TimeGrid
 from taichi_msm.model.tool_force import control_points
-from taichi_msm.model.tools import Clamp, Tool, build_tools, touching_tools
+from taichi_msm.model.tools import Tool, build_tools, clamps, solid_tools
 from taichi_msm.scene.scene import Scene
 from taichi_msm.scene.sheet import Sheet
 from taichi_msm.scene.tools import Probe
@@ -123,12 +123,12 @@ class Plan:
     @property
     def is_held(self) -> bool:
         """Whether any mass point is fixed or clamped."""
-        return bool(self.fixed.any()) or any(isinstance(tool, Clamp) for tool in self.tools)
+        return bool(self.fixed.any()) or bool(clamps(self.tools))
 
     @property
     def has_contact(self) -> bool:
         """Whether mass points can meet and leave a tool."""
-        return bool(touching_tools(self.tools))
+        return bool(solid_tools(self.tools))
 
     def with_grid(self, **changes: Any) -> Plan:
         """Return a copy with other attributes of the time grid, such as `steps_per_frame` or `precision`."""

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from taichi_msm.model.sheet import axes
 from taichi_msm.model.tool_force import control_point
-from taichi_msm.model.tools import build_tools, unit_vector
+from taichi_msm.model.tools import build_tools, solid_tools, unit_vector
 from taichi_msm.scene.scene import Scene
 from taichi_msm.scene.sheet import Sheet
 from taichi_msm.scene.tools import Instrument
@@ -162,14 +162,14 @@ def place_instruments(scene: Scene, position: NDArray[np.floating], time: float)
         position: positions of the mass points at this time [m], shape (rows, cols, 3).
         time: time [s].
     """
-    moved = {tool.probe: tool for tool in build_tools(scene.probes, scene.sheet)}
+    moved = {tool.probe: tool for tool in solid_tools(build_tools(scene.probes, scene.sheet)).values()}
     placed = []
     for index, probe in enumerate(scene.probes):
         if probe.instrument is None:
             continue
         if index in moved:
             tool = moved[index]
-            tip = tool.tip_centre(np.array([time]))[0]
+            tip = tool.path_at(np.array([time]))[0]
             placed.append(Solid(tip, tool.axis, tool.length, tool.radius, tool.shape))
         else:
             placed.append(place_instrument(probe.instrument, scene, position, control_point(probe, scene.sheet, time)))

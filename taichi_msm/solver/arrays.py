@@ -253,7 +253,7 @@ def build_read(config: KernelConfig, *, parallel: bool, iterations: int) -> Call
         The kernel `read`, see `SheetKernel.read`.
     """
     real, vector, vectors, lanes = config.real, config.vector, config.vectors, config.lanes
-    count, area_share = config.first_constant(None), build_point_functions(config).area_share
+    count, area_share = config.constants().end, build_point_functions(config).area_share
     measuring = [measure for term in config.terms for measure in term.build_measures(config)]
     reductions = ["sum", *(reduction for term in config.terms for reduction in term.reductions)]
 

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from taichi_msm.solver.arrays import SheetArrays, SheetLayout
 from taichi_msm.system.runtime import compilation_options, ti
 from taichi_msm.terms.base import KernelConfig, KernelSheet
-from taichi_msm.terms.contact import CORRECTIONS, ContactTerm
+from taichi_msm.terms.contact import ContactTerm
 from taichi_msm.terms.points import build_point_functions
 
 
@@ -28,17 +28,17 @@ def sum_corrections(layout: SheetLayout, arrays: SheetArrays, *, clear: bool) ->
     contact = layout.config.get(ContactTerm)
     if contact is None:
         return np.zeros((0, 3))
-    sums = np.empty((CORRECTIONS * len(contact.shapes), layout.rows))
+    sums = np.empty((3 * len(contact.shapes), layout.rows))
     with compilation_options():
         _build_sum(layout.config)(layout.rows, layout.cols, clear, arrays.by_column, arrays.fields, sums)
-    return sums.sum(axis=1).reshape(-1, CORRECTIONS)
+    return sums.sum(axis=1).reshape(-1, 3)
 
 
 @cache
 def _build_sum(config: KernelConfig) -> Callable[..., None]:
     """Build the kernel that sums the corrections in every row, per tool and component."""
     vector, vectors, lanes, serial = config.vector, config.vectors, config.lanes, config.lanes > 1
-    first, count = config.first_field(ContactTerm), CORRECTIONS * len(config.require(ContactTerm).shapes)
+    first, count = config.fields(ContactTerm).corrections[0].start, 3 * len(config.require(ContactTerm).shapes)
     by_area, area_share = config.by_area, build_point_functions(config).area_share
 
     @ti.kernel

@@ -121,13 +121,21 @@ class ScatterKernel(StepKernel):
 
     def _launch(self, kernel: Callable[..., None], workers: int, count: int, table: NDArray[Any]) -> None:
         layout = self._layout
-        # In the order of the constants in `bands`.
-        sizes = np.array([
-            self._steps, count, workers, layout.depth, self._carried_rows, layout.rows, layout.strip,
-            self._first_row, self._end_row, layout.rows + len(self._borders), MAX_CHECKS,
-        ])  # fmt: skip
+        sizes = bands.Launch(
+            steps_before=self._steps,
+            count=count,
+            workers=workers,
+            depth=layout.depth,
+            carried_rows=self._carried_rows,
+            rows=layout.rows,
+            strip=layout.strip,
+            first_row=self._first_row,
+            end_row=self._end_row,
+            moment_row=layout.rows + len(self._borders),
+            max_checks=MAX_CHECKS,
+        )
         with compilation_options():
-            kernel(sizes, self._progress, table, *self._carried, *self.arrays.all)
+            kernel(np.array(sizes), self._progress, table, *self._carried, *self.arrays.all)
         self._steps += count
 
     def _border_rows(self) -> NDArray[np.int32]:

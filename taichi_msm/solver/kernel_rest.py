@@ -36,7 +36,7 @@ from taichi_msm.solver.arrays import (
     build_read,
     to_lanes,
 )
-from taichi_msm.solver.bands import MOMENT_ROWS, RowBand, build_fill_halo, build_step_row
+from taichi_msm.solver.bands import MOMENT_ROWS, BandStep, RowBand, build_fill_halo, build_step_row
 from taichi_msm.system.runtime import compilation_options, ti, write_vectors
 from taichi_msm.terms.base import Entry, KernelConfig, KernelRow, KernelSheet, RestCorrection
 from taichi_msm.terms.bending import BendingTerm
@@ -192,10 +192,10 @@ def _build_store(config: KernelConfig) -> Callable[..., None]:
 def _build_relax(config: KernelConfig) -> Callable[..., None]:
     """Build the kernel that evaluates forces and moves mass points."""
     real, vector, vectors, lanes = config.real, config.vector, config.vectors, config.lanes
-    constant_count, fill_halo = config.first_constant(None), build_fill_halo(config)
+    constant_count, fill_halo = config.constants().end, build_fill_halo(config)
     step_row = build_step_row(config, _build_store(config), corrects=False, parallel=False)
     moments = 0 if config.get(BendingTerm) is None else MOMENT_ROWS
-    columns, corrections = config.first_column(None), _corrections(config)
+    columns, corrections = config.columns().end, _corrections(config)
     removals, projections = [each.remove for each in corrections], [each.project for each in corrections]
 
     @ti.func
@@ -212,8 +212,9 @@ def _build_relax(config: KernelConfig) -> Callable[..., None]:
         """Evaluate the forces on all mass points and their reductions."""
         for n in range(sheet.rows * sheet.width, (sheet.rows + SUMS) * sheet.width):
             sheet.work[n] = vector(0)
+        step = ti.static(BandStep(0, 0, sheet.rows + moments, sheet.rows))
         for line in range(-1, band.high - band.low):
-            step_row(sheet, sheet.u, row, band, line, 0, 0, sheet.rows + moments, sheet.rows)
+            step_row(sheet, sheet.u, row, band, step, line)
 
     @ti.func
     def move_points(sheet: ti.template(), row: ti.template(), band: ti.template(), keep, gain, dt, back):
@@ -271,7 +272,7 @@ def _build_relax(config: KernelConfig) -> Callable[..., None]:
             constants = [constants_of[n][0] for n in ti.static(range(constant_count))]
             u, forces, q = ti.static((u_x, u_y, u_z), (d_x, d_y, d_z), (q_x, q_y, q_z))
             sheet = ti.static(RestSheet(u, forces, by_column, fields, constants, rows, width, q, work))
-            band = ti.static(RowBand(0, 1, low, high, 1, rows, 0, fire))
+            band = ti.static(RowBand(0, 1, low, high, 1, rows))
             if fire[PLACED] > 0:
                 for i in range(low, high):
                     settle_row(sheet, row, i)
@@ -318,8 +319,8 @@ def _build_relax(config: KernelConfig) -> Callable[..., None]:
 @cache
 def _build_scale(config: KernelConfig) -> Callable[..., None]:
     """Build the kernel of `Relaxation.scale`."""
-    real, vector, vectors, columns = config.real, config.vector, config.vectors, config.first_column(None)
-    constant_count, mobility = config.first_constant(None), build_point_functions(config).mobility
+    real, vector, vectors, columns = config.real, config.vector, config.vectors, config.columns().end
+    constant_count, mobility = config.constants().end, build_point_functions(config).mobility
     max_spring_force = config.require(SpringTerm).build_max_spring_force(config)
     forces = [
         force for term in config.terms if not isinstance(term, BendingTerm) for force in term.build_forces(config)

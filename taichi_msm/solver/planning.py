@@ -32,7 +32,7 @@ from taichi_msm.model.sheet import (
     tissue_problems,
 )
 from taichi_msm.model.time_grid import TimeGrid
-from taichi_msm.model.tools import Tool, build_tools, friction_problem, path_problems, speed_problem
+from taichi_msm.model.tools import SolidTool, build_tools, path_problems, solid_tools
 from taichi_msm.model.verlet import stability_limit
 from taichi_msm.scene.scene import Scene, Time
 from taichi_msm.scene.section import FRAME_TOLERANCE
@@ -376,15 +376,16 @@ def _path_problems(plan: Plan, index: int, before: Probe, given: Probe, now: flo
         yield Problem((*key, "clamp"), "cannot change; restart with the new scene")
         return
     joined, first = _join_paths(plan, before, given, now)
-    (old_tool,), (tool,) = build_tools((before,), sheet), build_tools((joined,), sheet)
-    if problem := friction_problem(tool, at_rest=at_rest):
-        yield Problem((*key, "friction"), problem)
-    if not at_rest and (fault := speed_problem(tool, plan.grid, first)):
-        yield Problem((*key, "path", fault[0] - first - 1), fault[1])
-    deviation = _shape_change(old_tool, tool)
-    if deviation > tool.stride_limit:
-        text = f"changes by {deviation:.3g} m in a step, over {tool.stride_limit:.3g} m; change it gradually"
-        yield Problem((*key, "instrument"), text)
+    old_tools, tools = (solid_tools(build_tools((probe,), sheet)) for probe in (before, joined))
+    for n, tool in tools.items():
+        if problem := tool.friction_problem(at_rest=at_rest):
+            yield Problem((*key, "friction"), problem)
+        if not at_rest and (fault := tool.speed_problem(plan.grid, first)):
+            yield Problem((*key, "path", fault[0] - first - 1), fault[1])
+        deviation = _shape_change(old_tools[n], tool)
+        if deviation > tool.stride_limit:
+            text = f"changes by {deviation:.3g} m in a step, over {tool.stride_limit:.3g} m; change it gradually"
+            yield Problem((*key, "instrument"), text)
     for n, (begin, end) in enumerate(given.grip):
         has_ended = end <= now + tolerance
         continues = any(begin == old_begin and old_end > now + tolerance for old_begin, old_end in before.grip)
@@ -403,7 +404,7 @@ def _past_keyframes(path: Sequence[Keyframe], now: float, tolerance: float) -> l
     return [*past, (now, across, down, height)]
 
 
-def _shape_change(before: Tool, after: Tool) -> float:
+def _shape_change(before: SolidTool, after: SolidTool) -> float:
     """Bound the displacement [m] of points of a tool whose shape changes while its lowest point is fixed."""
     ends = np.linalg.norm(after.length * after.axis - before.length * before.axis)
     return float(ends) + 2 * abs(after.radius - before.radius)

@@ -14,7 +14,7 @@ Contact with position-controlled tools is resolved afterwards, in the rows that 
 from collections.abc import Callable
 
 from taichi_msm.system.runtime import ti
-from taichi_msm.terms.base import DX, DY, HAS_LEFT, HAS_RIGHT, Correction, Entry, KernelConfig, RowPair, build_max_lane
+from taichi_msm.terms.base import BY_COLUMN, DX, DY, Correction, Entry, KernelConfig, RowPair, build_max_lane
 from taichi_msm.terms.springs import SpringTerm
 
 
@@ -29,7 +29,7 @@ def build_pass_row(config: KernelConfig, move: Callable[..., None]) -> Callable[
     Returns:
         The Taichi function pass_row(sheet, carried, carried_row, line, source, next_row, exists, up, loads, n, moving).
     """
-    vector, columns, springs = config.vector, config.first_column(None), config.require(SpringTerm)
+    vector, columns, springs = config.vector, config.columns().end, config.require(SpringTerm)
     structural, shear, open_edges = springs.structural, springs.shear, springs.open_edges
     force_on_right, force_on_other = springs.build_spring_forces(config)
 
@@ -65,7 +65,7 @@ def build_pass_row(config: KernelConfig, move: Callable[..., None]) -> Callable[
         this, following = [vector(0) for _ in ti.static(range(3))], [vector(0) for _ in ti.static(range(3))]
         has_left, has_right = vector(1), vector(1)
         if ti.static(open_edges):
-            has_right = sheet.by_column[HAS_RIGHT * width + 0]
+            has_right = sheet.by_column[BY_COLUMN.has_right * width + 0]
         u = [sheet.u[c][row] for c in ti.static(range(3))]
         if ti.static(structural):
             first = force_on_right(sheet, pair, row + 1, 0, u, has_right)
@@ -86,7 +86,10 @@ def build_pass_row(config: KernelConfig, move: Callable[..., None]) -> Callable[
                 last[c] = this[c]
                 this[c] = following[c]
             if ti.static(open_edges):
-                has_left, has_right = sheet.by_column[HAS_LEFT * width + b], sheet.by_column[HAS_RIGHT * width + b]
+                has_left, has_right = (
+                    sheet.by_column[BY_COLUMN.has_left * width + b],
+                    sheet.by_column[BY_COLUMN.has_right * width + b],
+                )
             if ti.static(shear):
                 to_left = force_on_other(sheet, pair, next_at + b - 1, -1, b, u, has_left * exists)
                 for c in ti.static(range(3)):
@@ -117,7 +120,7 @@ def build_pass_row(config: KernelConfig, move: Callable[..., None]) -> Callable[
                 move(sheet, entry, source, force, now)
         if ti.static(shear):
             if ti.static(open_edges):
-                has_left = sheet.by_column[HAS_LEFT * width + strip + 1]
+                has_left = sheet.by_column[BY_COLUMN.has_left * width + strip + 1]
             for c in ti.static(range(3)):
                 u[c] = sheet.u[c][row + strip + 1]
             end = force_on_other(sheet, pair, next_at + strip, -1, strip + 1, u, has_left * exists)
@@ -139,7 +142,7 @@ def build_correct_row(config: KernelConfig, correction: Correction) -> Callable[
     Returns:
         The Taichi function correct_row(sheet, i, kind, loads, n), for row i and row n of the load table.
     """
-    columns, (reaches, resolve), max_lane = config.first_column(None), correction, build_max_lane(config)
+    columns, (reaches, resolve), max_lane = config.columns().end, correction, build_max_lane(config)
 
     @ti.func
     def correct_row(sheet: ti.template(), i, kind, loads: ti.template(), n):

@@ -23,7 +23,7 @@ from taichi_msm.system.process import available_threads
 from taichi_msm.system.runtime import Device, lanes
 from taichi_msm.terms import base, build_terms
 from taichi_msm.terms.loads import ProbeTerm, decay_parameters
-from taichi_msm.terms.springs import MAX_STRAIN, MIN_STRAIN, SpringTerm
+from taichi_msm.terms.springs import SpringTerm
 
 Kernel = TypeVar("Kernel", bound=SheetKernel)
 
@@ -150,7 +150,7 @@ class SheetSolver(ABC, Generic[Kernel]):
                 raise ArgumentError(f"probes: {reason}")
         if decay_parameters(plan) != decay_parameters(self.plan):
             probes = config.require(ProbeTerm)
-            self.kernel.arrays.set_fields(config.first_field(ProbeTerm), probes.fields(plan))
+            self.kernel.arrays.set_fields(config.fields(ProbeTerm).first, probes.fields(plan))
         self.plan = plan
 
     @abstractmethod
@@ -194,10 +194,9 @@ class SheetSolver(ABC, Generic[Kernel]):
             first: number of the first step.
         """
         config = self.layout.config
-        table = np.zeros((len(loads.active), config.first_column(None)))
+        table = np.zeros((len(loads.active), config.columns().end))
         for term in config.terms:
-            column = config.first_column(type(term))
-            table[:, column : column + term.column_count] = term.columns(self.plan, loads, first)
+            table[:, config.columns(type(term)).all] = term.columns(self.plan, loads, first)
         # Loads too large for f32 become infinite; the next reading of the sheet detects it.
         with np.errstate(over="ignore"):
             return table.astype(self._dtype)
@@ -206,20 +205,19 @@ class SheetSolver(ABC, Generic[Kernel]):
         """Read and measure the sheet; with `moving`, the energy includes the kinetic energy."""
         displacement, measures = self._read_arrays(differences=False)
         config, plan = self.layout.config, self.plan
-        springs = measures[:, config.first_measure(SpringTerm) :]
+        springs = config.measures(SpringTerm)
         # The measures are (L^2 - L0^2) / L0^2.
-        extremes = springs[:, MIN_STRAIN].min(), springs[:, MAX_STRAIN].max()
+        extremes = measures[:, springs.min_strain].min(), measures[:, springs.max_strain].max()
         shortest, longest = (math.sqrt(max(0.0, 1.0 + float(extreme))) for extreme in extremes)
         sums = measures.sum(axis=0, dtype=np.float64)
         energy = plan.material.mass * float(sums[base.SQUARED_MOTION]) / plan.grid.step**2 if moving else 0.0
         for term in config.terms:
-            first = config.first_measure(type(term))
-            energy += term.energy(sums[first : first + len(term.reductions)], plan)
+            energy += term.energy(sums[config.measures(type(term)).all], plan)
         return Reading(self.steps_done, displacement, shortest, longest, energy / 2)
 
     def _read_arrays(self, *, differences: bool) -> tuple[NDArray[Any], NDArray[Any]]:
         """Read displacements or last differences, and measures of every row, see `SheetKernel.read`."""
-        rows, cols, count = self.layout.rows, self.layout.cols, self.layout.config.first_measure(None)
+        rows, cols, count = self.layout.rows, self.layout.cols, self.layout.config.measures().end
         values, measures = np.empty((rows, cols, 3), self._dtype), np.empty((rows, count), self._dtype)
         self.kernel.read(differences, values, measures)
         return values, measures
@@ -237,14 +235,14 @@ class SheetSolver(ABC, Generic[Kernel]):
 def _initial_data(plan: Plan, layout: SheetLayout, state: State | None) -> InitialData:
     sheet, config = plan.scene.sheet, layout.config
     column, areas, mobility = np.arange(layout.cols), area_shares(sheet), plan.mobility
-    by_column = np.empty((base.COLUMN_ROWS, layout.cols))
+    by_column, places = np.empty((base.BY_COLUMN.count, layout.cols)), base.BY_COLUMN
     # One row of each kind: first, middle, last.
-    by_column[base.MOBILITY : base.MOBILITY + 3] = mobility[[0, layout.rows // 2, -1]]
+    by_column[places.mobility] = mobility[[0, layout.rows // 2, -1]]
     # Springs along columns read the shares of a middle row even in a sheet of two rows.
-    by_column[base.AREA_SHARE : base.AREA_SHARE + 3] = areas[0], 2 * areas[0], areas[-1]
-    by_column[base.REST_X] = axes(sheet)[0]
-    by_column[base.HAS_LEFT] = column > 0
-    by_column[base.HAS_RIGHT] = column < layout.cols - 1
+    by_column[places.area_share] = areas[0], 2 * areas[0], areas[-1]
+    by_column[places.rest_x] = axes(sheet)[0]
+    by_column[places.has_left] = column > 0
+    by_column[places.has_right] = column < layout.cols - 1
     of_terms = (constant for term in config.terms for constant in term.constants(plan))
     constants = *spacing(sheet), sheet.size[0] / 2, *of_terms
     fields = [term.fields(plan) for term in config.terms]

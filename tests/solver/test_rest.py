@@ -130,7 +130,7 @@ def test_grip_matches_scipy(device: Device) -> None:
     rest.advance(1)
     before, tip = rest.displacement(), plan.tools[0]
     rest.advance(1)
-    u, middle = rest.displacement(), tip.tip_centre(np.array([1.0, 2.0]))
+    u, middle = rest.displacement(), tip.path_at(np.array([1.0, 2.0]))
     held = np.linalg.norm(rest_positions(plan.scene.sheet) + before - middle[0], axis=-1) <= 1.5 * tip.radius
     assert held.sum() > 4
     moved_by = np.where(held[..., None], before + middle[1] - middle[0], 0)
