@@ -57,10 +57,7 @@ class ProbeSlot:
 def probe_slots(probes: Sequence[Probe], sheet: Sheet, h: float) -> tuple[ProbeSlot, ...]:
     """Return the slots of all force-controlled probes, in the order of the probes.
 
-    Args:
-        probes: all probes of a scene; position-controlled tools have no slots.
-        sheet: supplies the size that converts `probe.at` to metres.
-        h: half-width of the hat, equal to the time step [s]; 0 for loads without averages, with one slot per probe.
+    The half-width h of the hat is the time step [s], or 0 for loads without averages, with one slot per probe.
     """
     slots = []
     for index, probe in enumerate(probes):
@@ -77,12 +74,7 @@ def probe_slots(probes: Sequence[Probe], sheet: Sheet, h: float) -> tuple[ProbeS
 
 
 def build_slots(scene: Scene, grid: TimeGrid) -> tuple[ProbeSlot, ...]:
-    """Return the slots of a scene's probes, in their order, one per probe in a quasi-static scene.
-
-    Args:
-        scene: supplies the probes and the kind of motion.
-        grid: supplies the step, the half-width of the hat.
-    """
+    """Return the slots of a scene's probes, in their order, one per probe in a quasi-static scene."""
     return probe_slots(scene.probes, scene.sheet, 0.0 if scene.time.at_rest else grid.step)
 
 
@@ -138,11 +130,7 @@ class Plan:
         return replace(self, grid=grid, slots=build_slots(self.scene, grid))
 
     def with_probes(self, probes: Sequence[Probe | Mapping[str, Any]]) -> Plan:
-        """Return a copy with other probes, each a `Probe` or a mapping of its keys.
-
-        Raises:
-            SceneError: when a mapping is not a valid probe.
-        """
+        """Return a copy with other probes, each a `Probe` or a mapping of its keys; a SceneError if one is invalid."""
         scene = self.scene.model_copy(update={"probes": tuple(probes)})
         tools = build_tools(scene.probes, scene.sheet)
         return replace(self, scene=scene, slots=build_slots(scene, self.grid), tools=tools)

@@ -42,14 +42,9 @@ def coefficients(plan: Plan) -> Coefficients:
 
 
 def mean_force(plan: Plan, displacement: NDArray[Any], steps: int) -> NDArray[Any]:
-    """Return the mean contact force of some steps [N], from the displacements that contact added.
+    """Return the mean contact force of some steps [N], from the sum of the displacements that contact added [m].
 
     It is m (1 + g h / 2) / h^2 times the added displacement per step, or m / h^2 with backward differences.
-
-    Args:
-        plan: supplies the coefficients of the steps.
-        displacement: sum of the added displacements over the steps [m], any shape.
-        steps: number of steps.
     """
     return displacement / (coefficients(plan).gain * steps)
 
@@ -57,13 +52,8 @@ def mean_force(plan: Plan, displacement: NDArray[Any], steps: int) -> NDArray[An
 def stability_limit(frequency: float, drag: float, difference: str) -> float:
     """Return the largest stable step [s]; infinite without stiffness and damping.
 
-    It is 2 / w for central differences of the damping, and (sqrt(g^2 + 4 w^2) - g) / w^2 for backward ones, which the
-    code rearranges to avoid cancellation.
-
-    Args:
-        frequency: highest angular frequency w [rad/s].
-        drag: g = C / m [1/s].
-        difference: difference of the damping, central or backward.
+    For the highest angular frequency w [rad/s] it is 2 / w for central differences of the damping, and (sqrt(g^2 + 4
+    w^2) - g) / w^2 for backward ones, with g = C / m [1/s], which the code rearranges to avoid cancellation.
     """
     g = drag if difference == "backward" else 0.0
     limit = math.hypot(g, 2 * frequency) + g

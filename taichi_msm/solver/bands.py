@@ -166,8 +166,11 @@ def build_step_row(
             after = step.moments + (row + 1) % MOMENT_ROWS
             line = ti.static(KernelRow(i, kind, before, middle, after))
             exists = ti.cast(0 <= i + band.direction < band.rows, real)
-            source = stored_at(band, row, i, step.before)
-            next_row = stored_at(band, row + 1, ti.select(exists > 0, i + band.direction, i), step.before)
+            source = i
+            next_row = ti.select(exists > 0, i + band.direction, i)
+            if ti.static(parallel):
+                source = stored_at(band, row, i, step.before)
+                next_row = stored_at(band, row + 1, next_row, step.before)
             up = -band.direction * sheet.constants[DY]
             pass_row(sheet, carried, step.carry, line, source, next_row, exists, up, loads, step.n, row >= 0)
             if row >= 0:

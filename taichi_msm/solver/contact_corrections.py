@@ -18,12 +18,7 @@ from taichi_msm.terms.points import build_point_functions
 def sum_corrections(layout: SheetLayout, arrays: SheetArrays, *, clear: bool) -> NDArray[np.float64]:
     """Return the sums of the contact corrections [m], weighted with shares of a cell's mass, shape (tools, 3).
 
-    The order of summation depends neither on lanes nor on workers.
-
-    Args:
-        layout: layout of the sheet.
-        arrays: arrays of the sheet.
-        clear: whether to set the corrections to 0 afterwards.
+    The order of summation depends neither on lanes nor on workers. With `clear`, the corrections are then set to 0.
     """
     contact = layout.config.get(ContactTerm)
     if contact is None:
@@ -46,16 +41,7 @@ def _build_sum(config: KernelConfig) -> Callable[..., None]:
         rows: ti.i32, cols: ti.i32, clear: ti.i32,
         by_column: vectors, fields_of: vectors, sums: ti.types.ndarray(dtype=ti.f64, ndim=2),
     ):  # fmt: skip
-        """Sum the corrections in every row from left to right.
-
-        Args:
-            rows: number of rows of the sheet.
-            cols: number of columns of the sheet.
-            clear: whether to set the corrections to 0 afterwards.
-            by_column: as in `SheetArrays`.
-            fields_of: `SheetArrays.fields`.
-            sums: output [m], shape (tools x 3, rows).
-        """
+        """Sum the corrections in every row from left to right into `sums` [m], shape (tools x 3, rows)."""
         fields = ti.static(fields_of)
         ti.loop_config(serialize=serial)
         for i in range(rows):

@@ -24,12 +24,7 @@ STEPS_PER_LAUNCH = 8
 
 
 class GatherKernel(StepKernel):
-    """A sheet in the memory of a GPU; a launch takes at most STEPS_PER_LAUNCH steps.
-
-    Args:
-        layout: layout of the sheet, with one lane and without workers.
-        start: initial values.
-    """
+    """A sheet in the memory of a GPU, with one lane and no workers; a launch takes at most STEPS_PER_LAUNCH steps."""
 
     def __init__(self, layout: SheetLayout, start: InitialData) -> None:
         self._layout = layout
@@ -130,16 +125,7 @@ def _build_advance(config: KernelConfig) -> Callable[..., None]:
         d_x: vectors, d_y: vectors, d_z: vectors,
         constants_of: ti.types.ndarray(dtype=vector, ndim=1), by_column: vectors, fields: vectors,
     ):  # fmt: skip
-        """Advance by the steps of a launch.
-
-        Args:
-            buffer: index of the buffer with u_n, 0 or 1.
-            count: number of steps, at most STEPS_PER_LAUNCH.
-            rows: number of rows of the sheet.
-            cols: number of columns of the sheet.
-            loads: load table of the launch, shape (steps, columns).
-            u_x, u_y, u_z, d_x, d_y, d_z, constants_of, by_column, fields: `SheetArrays.all`.
-        """
+        """Advance by at most STEPS_PER_LAUNCH steps with a row of `loads` each, from u_n in `buffer` 0 or 1."""
         for n in ti.static(range(STEPS_PER_LAUNCH)):
             for store_moment in ti.static(storing):
                 for i, b in ti.ndrange((-1, rows + 1), cols + 2):

@@ -88,13 +88,7 @@ class RestSheet(NamedTuple):
 class Relaxation(SheetKernel):
     """A sheet in the memory of a CPU, and the kernels that find its equilibrium.
 
-    Args:
-        layout: layout of the sheet.
-        start: initial values.
-        masses: fictitious masses M [N/m], shape (rows, cols).
-
-    Attributes:
-        masses: as given.
+    Its fictitious masses M [N/m] have the shape (rows, cols).
     """
 
     def __init__(self, layout: SheetLayout, start: InitialData, masses: NDArray[Any]) -> None:
@@ -125,15 +119,9 @@ class Relaxation(SheetKernel):
         self.arrays.set_displacement(displacement)
 
     def relax(self, count: int, tolerance: float, row: NDArray[Any]) -> tuple[int, float]:
-        """Evaluate the forces and move the mass points until no force exceeds a tolerance.
+        """Evaluate the forces and move the mass points, at most `count` times, until no force exceeds a tolerance [N].
 
-        Args:
-            count: largest number of evaluations.
-            tolerance: largest force on a mass point [N].
-            row: row of the load table, shape (1, columns).
-
-        Returns:
-            Number of evaluations, and the largest force of the last one [N], infinite if any force is NaN.
+        Return the number of evaluations, and the largest force of the last one [N], infinite if any force is NaN.
         """
         fire = self._fire
         fire[[COUNT, SQUARED_TOLERANCE]] = count, tolerance * tolerance
@@ -257,12 +245,8 @@ def _build_relax(config: KernelConfig) -> Callable[..., None]:
     ):  # fmt: skip
         """Evaluate the forces and move the mass points, see `Relaxation.relax`.
 
-        Args:
-            fire: arguments, state of FIRE and results, in the order of ROWS, ..., FORCE_SUM, shape (NUMBERS,).
-            row: row of the load table, shape (1, columns).
-            q_x, q_y, q_z: momenta [N].
-            work: 1 / M of every mass point [m/N], followed by SUMS rows of reductions.
-            u_x, u_y, u_z, d_x, d_y, d_z, constants_of, by_column, fields: `SheetArrays.all`.
+        `fire` has arguments, state of FIRE and results, in the order of ROWS, ..., FORCE_SUM, and `row` is a row of the
+        load table. `work` has 1 / M of every mass point [m/N], followed by SUMS rows of reductions; q are momenta [N].
         """
         ti.loop_config(serialize=True)
         for _ in range(1):
@@ -334,15 +318,7 @@ def _build_scale(config: KernelConfig) -> Callable[..., None]:
         d_x: vectors, d_y: vectors, d_z: vectors,
         constants_of: ti.types.ndarray(dtype=vector, ndim=1), by_column: vectors, fields: vectors,
     ):  # fmt: skip
-        """Compute the square of the largest force of a spring, a load or the foundation on a mass point.
-
-        Args:
-            rows: number of rows of the sheet.
-            width: number of entries of a row.
-            result: output, the square [N^2], shape (1,).
-            row: row of the load table, shape (1, columns).
-            u_x, u_y, u_z, d_x, d_y, d_z, constants_of, by_column, fields: `SheetArrays.all`.
-        """
+        """Compute the square of the largest force of a spring, a load or the foundation on a mass point [N^2]."""
         ti.loop_config(serialize=True)
         for _ in range(1):
             constants = [constants_of[n][0] for n in ti.static(range(constant_count))]

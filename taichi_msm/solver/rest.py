@@ -57,9 +57,8 @@ Array = NDArray[np.float64]
 class QuasiStatics(SheetSolver[Relaxation]):
     """The sheet in quasi-static motion, solved by a single worker of a CPU.
 
-    Attributes:
-        evaluations: number of evaluations of the forces for the last frame.
-        residual: largest residual force of the last frame, relative to the largest force.
+    For the last frame it has the number of `evaluations` of the forces, and the largest `residual` force, relative to
+    the largest force.
     """
 
     @staticmethod
@@ -76,12 +75,8 @@ class QuasiStatics(SheetSolver[Relaxation]):
     def advance(self, steps: int, pause: Pause = lambda: None) -> None:
         """Find the equilibria of the next frames, and of the first frame if it is still missing.
 
-        Args:
-            steps: number of frames.
-            pause: called between launches; after an exception from it, another call continues from the last frame.
-
-        Raises:
-            DivergedError: when the iteration does not converge.
+        After an exception from `pause`, called between launches, another call continues from the last frame. A
+        DivergedError reports an iteration that does not converge.
         """
         end = self.steps_done + steps
         while self._last_frame is None or self.steps_done < end:
@@ -285,15 +280,8 @@ class QuasiStatics(SheetSolver[Relaxation]):
 def build_solver(
     plan: Plan, device: Device, layout: SheetLayout | None = None, cores: int | None = None
 ) -> SheetSolver[Any]:
-    """Build the solver of a plan, dynamic or quasi-static.
+    """Build the solver of a plan, dynamic or quasi-static, with the sheet at rest.
 
-    Args:
-        plan: plan of the run.
-        device: device of the arrays.
-        layout: replaces the layout chosen by `choose_layout`, for tests.
-        cores: largest number of CPU cores; by default all available cores.
-
-    Returns:
-        Solver with the sheet at rest; a quasi-static one finds the first frame in its first call of `advance`.
+    A quasi-static one finds the first frame in its first call of `advance`.
     """
     return (QuasiStatics if plan.scene.time.at_rest else Dynamics)(plan, device, layout, cores)

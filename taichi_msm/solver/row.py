@@ -21,13 +21,7 @@ from taichi_msm.terms.springs import SpringTerm
 def build_pass_row(config: KernelConfig, move: Callable[..., None]) -> Callable[..., None]:
     """Build the Taichi function that computes the forces on a row and steps it.
 
-    Args:
-        config: compile-time configuration.
-        move: Taichi function move(sheet, entry, target, force, now) that steps an entry with the force of its springs,
-            see `build_point_step`.
-
-    Returns:
-        The Taichi function pass_row(sheet, carried, carried_row, line, source, next_row, exists, up, loads, n, moving).
+    move(sheet, entry, target, force, now) steps an entry with the force of its springs, see `build_point_step`.
     """
     vector, columns, springs = config.vector, config.columns().end, config.require(SpringTerm)
     structural, shear, open_edges = springs.structural, springs.shear, springs.open_edges
@@ -38,20 +32,11 @@ def build_pass_row(config: KernelConfig, move: Callable[..., None]) -> Callable[
         sheet: ti.template(), carried: ti.template(), carried_row, line: ti.template(), source, next_row, exists, up,
         loads: ti.template(), n, moving,
     ):  # fmt: skip
-        """Compute the forces on a row, and step it if `moving`.
+        """Compute the forces on a row `line`, and step it if `moving`.
 
-        Args:
-            sheet: a `KernelSheet`.
-            carried: forces carried to the next row [N], as three arrays.
-            carried_row: row of `carried`.
-            line: the row, a `KernelRow`.
-            source: row of u with its displacements.
-            next_row: row of u with the displacements of the next row of the pass.
-            exists: 1, or 0 if the sheet has no next row.
-            up: y of the next row minus y of this row, at rest [m].
-            loads: load table, shape (steps, columns).
-            n: row of the load table.
-            moving: whether to step the row.
+        Its displacements are in row `source` of u, those of the next row of the pass in row `next_row`. `exists` is 1,
+        or 0 if the sheet has no next row, and `up` its y minus that of this row, at rest [m]. Row `carried_row` of the
+        three arrays `carried` has the forces carried to the next row [N]; row n of `loads` is that of the step.
         """
         width, strip, i = sheet.width, sheet.width - 2, line.i
         diagonal = ti.sqrt(sheet.constants[DX] * sheet.constants[DX] + sheet.constants[DY] * sheet.constants[DY])
@@ -133,15 +118,7 @@ def build_pass_row(config: KernelConfig, move: Callable[..., None]) -> Callable[
 
 
 def build_correct_row(config: KernelConfig, correction: Correction) -> Callable[..., None]:
-    """Build the Taichi function that applies the correction of a term to a row, if the row may need it.
-
-    Args:
-        config: compile-time configuration.
-        correction: Taichi functions of the term.
-
-    Returns:
-        The Taichi function correct_row(sheet, i, kind, loads, n), for row i and row n of the load table.
-    """
+    """Build the Taichi function correct_row(sheet, i, kind, loads, n), which corrects row i, if a term may need it."""
     columns, (reaches, resolve), max_lane = config.columns().end, correction, build_max_lane(config)
 
     @ti.func

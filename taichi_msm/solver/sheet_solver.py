@@ -35,15 +35,9 @@ CACHED_BAND_BYTES = 384 << 10
 
 
 def choose_layout(plan: Plan, device: Device, cores: int | None = None) -> SheetLayout:
-    """Return the memory layout of a sheet, its division among workers, and the configuration of its kernels.
+    """Choose the memory layout of a sheet, its division among up to `cores` workers, and its kernels' configuration.
 
-    Args:
-        plan: plan of the run.
-        device: device of the arrays.
-        cores: largest number of CPU cores; by default all available cores.
-
-    Raises:
-        DeviceError: when the device does not support the scene.
+    By default all available cores are used. A DeviceError reports a device that does not support the scene.
     """
     (rows, cols), fixed, precision = plan.scene.sheet.points, plan.fixed, plan.grid.precision
     fixed_rows = bool(fixed[0].all()), bool(fixed[-1].all())
@@ -82,18 +76,8 @@ def choose_layout(plan: Plan, device: Device, cores: int | None = None) -> Sheet
 class SheetSolver(ABC, Generic[Kernel]):
     """A sheet that advances by steps; in quasi-static motion a frame counts as a step.
 
-    Args:
-        plan: plan of the run.
-        device: device of the arrays; for quasi-static motion a CPU.
-        layout: replaces the layout chosen by `choose_layout`, for tests.
-        cores: largest number of CPU cores; by default all available cores.
-
-    Attributes:
-        plan: current plan.
-        layout: memory layout, and configuration of the kernels.
-        steps_done: number of steps taken.
-        inconsistent: whether an interruption left the arrays inconsistent; all methods but `restart` then raise
-            MsmError.
+    A given `layout` replaces that of `choose_layout`, for tests. After `steps_done` steps an interruption can leave the
+    arrays `inconsistent`; all methods but `restart` then raise MsmError.
     """
 
     def __init__(self, plan: Plan, device: Device, layout: SheetLayout | None = None, cores: int | None = None) -> None:
@@ -111,11 +95,7 @@ class SheetSolver(ABC, Generic[Kernel]):
 
     @property
     def kernel(self) -> Kernel:
-        """The arrays of the sheet, with the kernels that move and read it.
-
-        Raises:
-            MsmError: when a restart was interrupted.
-        """
+        """The arrays of the sheet, with the kernels that move and read it; an MsmError after an interrupted restart."""
         if self._kernel is None:
             raise MsmError("interrupted while the sheet was restarted; restart the scene")
         return self._kernel
@@ -123,9 +103,7 @@ class SheetSolver(ABC, Generic[Kernel]):
     def restart(self, plan: Plan, state: State | None = None) -> None:
         """Restart with the same or another plan, without compilation if only coefficients differ.
 
-        Args:
-            plan: the plan.
-            state: state to continue from, of a sheet with the same mass points and steps; by default the sheet at rest.
+        By default the sheet is at rest; a state to continue from has the same mass points and steps.
         """
         self.inconsistent = True
         self._begin(state)
@@ -136,11 +114,7 @@ class SheetSolver(ABC, Generic[Kernel]):
         self.inconsistent = False
 
     def steer(self, plan: Plan) -> None:
-        """Continue with a plan that differs in its probes only, with the same kernels and steps.
-
-        Raises:
-            ArgumentError: when the new probes require other kernels.
-        """
+        """Continue with a plan that differs in its probes only; an ArgumentError if they require other kernels."""
         config, terms = self.layout.config, build_terms(plan)
         if [tool.probe for tool in plan.tools] != [tool.probe for tool in self.plan.tools]:
             raise ArgumentError("probes: which of them have a path cannot change; restart with the new scene")
@@ -155,11 +129,9 @@ class SheetSolver(ABC, Generic[Kernel]):
 
     @abstractmethod
     def advance(self, steps: int, pause: Pause = lambda: None) -> None:
-        """Advance by a number of steps.
+        """Advance by a number of steps; an exception from `pause`, called between launches, interrupts.
 
-        Args:
-            steps: number of steps.
-            pause: called between launches; an exception from it interrupts, and another call of `advance` continues.
+        Another call continues.
         """
 
     @abstractmethod
@@ -187,12 +159,7 @@ class SheetSolver(ABC, Generic[Kernel]):
         self._kernel = None
 
     def _load_table(self, loads: Schedule, first: int) -> NDArray[Any]:
-        """Return the load table of consecutive steps, with a gain of 0, shape (steps, columns).
-
-        Args:
-            loads: loads at the steps.
-            first: number of the first step.
-        """
+        """Return the load table of consecutive steps from `first` on, with a gain of 0, shape (steps, columns)."""
         config = self.layout.config
         table = np.zeros((len(loads.active), config.columns().end))
         for term in config.terms:

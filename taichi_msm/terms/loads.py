@@ -111,15 +111,10 @@ class ProbeTerm(Term):
         return np.array(gradients).reshape(-1, 2, *scene.sheet.points)
 
     def build_load_adjoint(self, config: KernelConfig, first_gradient: int) -> Callable[..., None]:
-        """Build the adjoint of the loads.
+        """Build add_adjoint(sums, sheet, entry, now), which differentiates force . `entry.u` of each slot.
 
-        Args:
-            config: compile-time configuration.
-            first_gradient: index of the first field of `decay_gradients` among the fields in `sheet.derivatives`.
-
-        Returns:
-            The Taichi function add_adjoint(sums, sheet, entry, now). It differentiates force . `entry.u` of each slot
-            with respect to the force (3) and the control point (2), and adds the derivatives to the list `sums`.
+        It adds the derivatives with respect to the force (3) and the control point (2) of each slot to the list `sums`.
+        `first_gradient` is the index of the first field of `decay_gradients` among the fields in `sheet.derivatives`.
         """
         ti = config.ti
         moves, by_area, slots = self.moves, self.by_area, config.columns(ProbeTerm).slots
@@ -180,12 +175,7 @@ def max_free_acceleration(plan: Plan) -> float:
 
 
 def decay_norm_bound(slot: ProbeSlot, plan: Plan) -> float:
-    """Return an upper bound of the Euclidean norm of a slot's decay factors, over all mass points.
-
-    Args:
-        slot: slot of a probe; its control point may move.
-        plan: plan of the slot.
-    """
+    """Return an upper bound of the Euclidean norm of a slot's decay factors, over all mass points."""
     scene = plan.scene
     if not slot.moves:
         return float(np.linalg.norm(decay(scene.probes[slot.probe], plan)))

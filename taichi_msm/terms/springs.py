@@ -269,15 +269,12 @@ class SpringTerm(Term):
         return tension
 
     def build_spring_forces(self, config: KernelConfig) -> tuple[Callable[..., Any], Callable[..., Any]]:
-        """Build the Taichi functions for the force of a mass point with displacement `u` on a neighbour [N].
+        """Build two Taichi functions for the force of a mass point with displacement `u` on a neighbour [N].
 
+        force_on_right(sheet, pair, entry, b, u, exists) is for the right neighbour, and force_on_other(sheet, pair,
+        entry, right, b, u, exists) for a neighbour in the other row of a `RowPair`, `right` columns to the right.
         `entry` is that of the neighbour in u, b that of the mass point in its row, and `exists` is 1, or 0 for a spring
         beyond an edge.
-
-        Returns:
-            force_on_right(sheet, pair, entry, b, u, exists) for the right neighbour;
-            force_on_other(sheet, pair, entry, right, b, u, exists) for a neighbour in the other row of a `RowPair`,
-            `right` columns to the right.
         """
         ti, vector, tense, curved = config.ti, config.vector, self.tense, config.curved
         open_edges, tense_edges = self.open_edges, self.tense_edges
@@ -561,15 +558,9 @@ def assemble_springs(material: Material, points: tuple[int, int]) -> Springs:
 
 
 def spring_stiffness(material: Material, factors: NDArray[Any]) -> tuple[NDArray[Any], NDArray[Any], NDArray[Any]]:
-    """Assemble the stiffness k of every spring from the factors of its cells.
+    """Return the stiffness k of every spring [N/m], for factors of the cells, shape (rows - 1, cols - 1).
 
-    Args:
-        material: coefficients of the sheet.
-        factors: factors of the map, shape (rows - 1, cols - 1).
-
-    Returns:
-        Stiffness [N/m] of springs along rows, shape (rows, cols - 1), along columns, shape (rows - 1, cols), and along
-        both diagonals of a cell, shape (rows - 1, cols - 1).
+    The shapes are those of `Springs` for springs along rows, along columns and along both diagonals of a cell.
     """
     above_and_below, left_and_right = np.pad(factors, ((1, 1), (0, 0))), np.pad(factors, ((0, 0), (1, 1)))
     across = material.across / 2 * (above_and_below[:-1] + above_and_below[1:])
