@@ -1,10 +1,10 @@
 """Named places in an array: the index of each name follows from the sizes of the names before it.
 
-TOOL = Places(tip=3, radius=1)
-TOOL.tip, TOOL.radius                       # range(0, 3) and 3
-tools = Places(weight=1, tools=[TOOL] * 2)
-tools.tools[1].radius                       # 8
-tools.at(100).weight                        # 100
+With TOOL = Places(tip=3, radius=1) and all = Places(weight=1, tools=[TOOL] * 2)
+
+    TOOL.tip, TOOL.radius           range(0, 3) and 3
+    all.tools[1].radius             8
+    all.at(100).weight              100
 """
 
 from __future__ import annotations
