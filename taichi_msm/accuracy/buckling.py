@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 
 from taichi_msm.model.plan import Plan
-from taichi_msm.model.tools import touching_tools
+from taichi_msm.model.tools import solid_tools
 from taichi_msm.solver.state import RunProgress
 from taichi_msm.terms.springs import SpringTerm
 
@@ -43,5 +43,5 @@ def buckling_warnings(plan: Plan, progress: RunProgress) -> Iterator[str]:
 def _is_symmetric(plan: Plan) -> bool:
     """Return whether the mirror image of a motion, at the plane of the sheet at rest, is a solution, too."""
     forces = [probe.total or probe.force or (0, 0, 0) for probe in plan.scene.probes if probe.path is None]
-    crosses = any(force[2] != 0 for force in forces) or any(tool.tip_centres[:, 2].any() for tool in plan.tools)
-    return not crosses and not touching_tools(plan.tools)
+    crosses = any(force[2] != 0 for force in forces) or any(tool.path[:, 2].any() for tool in plan.tools)
+    return not crosses and not solid_tools(plan.tools)

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from taichi_msm.arithmetic import NUMPY
 from taichi_msm.model.plan import Plan
 from taichi_msm.model.sheet import rest_positions, spacing
-from taichi_msm.model.tools import Tool, touching_tools
+from taichi_msm.model.tools import SolidTool, solid_tools
 from taichi_msm.solver.state import RunProgress
 
 
@@ -19,7 +19,7 @@ def tool_contact_warnings(plan: Plan, progress: RunProgress) -> Iterator[str]:
     """Yield warnings of tools that slide through a soft sheet, and of the first tool that pierced the sheet."""
     membrane, foundation = _stiffnesses(plan)
     remedy = "take friction: rough, " if plan.scene.time.at_rest else ""
-    for tool in (tool for tool in touching_tools(plan.tools) if not tool.rough):
+    for tool in (tool for tool in solid_tools(plan.tools).values() if not tool.rough):
         # Deeper than a fifth of the radius, the mass points of a soft sheet slide off sideways.
         depth, limit = _max_depth(tool, plan.scene.time.duration), tool.radius / 5
         if membrane < (support := foundation * tool.radius**2) and depth > limit * (1 + 1e-9):
@@ -29,7 +29,7 @@ def tool_contact_warnings(plan: Plan, progress: RunProgress) -> Iterator[str]:
                 f"{support:.3g} N/m, and the depth of the tip, {1000 * depth:.3g} mm, is more than a fifth of its "
                 f"radius, {1000 * limit:.3g} mm; {remedy}press less deep, or with a wider tip"
             )
-    for tool in plan.tools:
+    for tool in solid_tools(plan.tools).values():
         if tool.probe == progress.pierced_by - 1:
             time, cell = progress.pierced_frame / plan.grid.frames_per_second, max(spacing(plan.scene.sheet))
             yield (
@@ -48,15 +48,15 @@ def first_piercing_probe(plan: Plan, displacement: NDArray[np.floating], frame: 
     if not plan.has_contact:
         return 0
     position, time = rest_positions(plan.scene.sheet) + displacement, frame / plan.grid.frames_per_second
-    return next((tool.probe + 1 for tool in touching_tools(plan.tools) if _pierces(tool, position, time)), 0)
+    return next((tool.probe + 1 for tool in solid_tools(plan.tools).values() if _pierces(tool, position, time)), 0)
 
 
-def _pierces(tool: Tool, position: NDArray[np.floating], time: float) -> bool:
+def _pierces(tool: SolidTool, position: NDArray[np.floating], time: float) -> bool:
     """Return whether the axis of a tool intersects a triangle of the sheet."""
     # Rows: the axis, up to its sign, and two directions orthogonal to it.
     basis = np.linalg.svd(tool.axis[None])[2]
     basis[0] = tool.axis
-    local = (position - tool.tip_centre(np.array([time]))[0]) @ basis.T
+    local = (position - tool.path_at(np.array([time]))[0]) @ basis.T
     # The axis can pass only through cells with corners on both sides of it, in both orthogonal directions.
     candidates = np.ones([count - 1 for count in position.shape[:2]], dtype=bool)
     for coordinate in (local[..., 1], local[..., 2]):
@@ -77,7 +77,7 @@ def _pierces(tool: Tool, position: NDArray[np.floating], time: float) -> bool:
     return False
 
 
-def _max_depth(tool: Tool, duration: float) -> float:
+def _max_depth(tool: SolidTool, duration: float) -> float:
     """Return the largest depth of a tip below the undeformed sheet [m]."""
     heights = np.interp([*tool.times, duration], tool.times, tool.heights)
     return -float(heights[np.array([*tool.times, duration]) <= duration * (1 + 1e-9)].min())

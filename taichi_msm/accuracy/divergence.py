@@ -31,7 +31,7 @@ def displacement_bound(
     """
     # Deformation moves a mass point by at most ten sizes of the sheet; a tool moves the tissue that it holds along its
     # path.
-    bound = 10.0 * max(plan.scene.sheet.size) + sum(tool.path_length + tool.radius for tool in plan.tools)
+    bound = 10.0 * max(plan.scene.sheet.size) + sum(tool.reach for tool in plan.tools)
     # Springs along rows and columns connect every mass point to a held one. Shear springs alone may connect only half.
     if plan.is_held and min(plan.material.across, plan.material.down) > 0:
         return bound
@@ -181,7 +181,7 @@ def _tool_energy_bound(plan: Plan) -> float:
     material, step, energy = plan.material, plan.grid.step, 0.0
     stiffness = sum(term.stiffness_bound(material, plan.scene.sheet) for term in TERMS)
     for tool in plan.tools:
-        distance, speed = tool.path_length + tool.radius, tool.max_stride(step)[0] / step
+        distance, speed = tool.reach, tool.max_stride(step)[0] / step
         energy += (stiffness * distance * distance + material.mass * speed * speed) / 2
     return plan.fixed.size * energy
 

@@ -44,7 +44,7 @@ from taichi_msm.errors import DivergedError, Pause, ProgressCallback, SceneError
 from taichi_msm.model.plan import Plan
 from taichi_msm.model.sheet import MAX_CELL_ASPECT, Maps, cell_aspect_ratio, spacing
 from taichi_msm.model.tool_force import sum_probe_forces
-from taichi_msm.model.tools import overlap, reaches_sheet, touching_tools
+from taichi_msm.model.tools import overlap, solid_tools
 from taichi_msm.scene.scene import Scene
 from taichi_msm.scene.section import MAX_POINTS
 from taichi_msm.scene.sheet import Sheet
@@ -179,11 +179,11 @@ class MeshCompanion:
         self._sampling_error = _sampling_force_error(plan.scene)
         self._contact, self._grips = plan.has_contact, any(tool.grips for tool in plan.tools)
         cell = max(spacing(plan.scene.sheet))
-        tools = [tool for tool in touching_tools(plan.tools) if tool.radius < MIN_RADIUS_CELLS * cell]
-        narrow = any(reaches_sheet(tool, plan.scene) for tool in tools)
+        narrow = [tool for tool in solid_tools(plan.tools).values() if tool.radius < MIN_RADIUS_CELLS * cell]
         overlaps = overlap(plan.tools, plan.scene.time.duration) is not None
         # Reason for an unknown error that does not depend on the companion runs.
-        self._unknown = NARROW_TIP if narrow else OVERLAP if overlaps else ""
+        is_narrow = any(tool.reaches(plan.scene) for tool in narrow)
+        self._unknown = NARROW_TIP if is_narrow else OVERLAP if overlaps else ""
         self._largest, self._shortest_spring = 0.0, 1.0
         self._second_run: MeshCompanion | None = None
 

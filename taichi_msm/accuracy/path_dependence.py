@@ -82,7 +82,7 @@ class PathDependence:
             grips = [grip_frames(grip, rate) for grip in tool.grips]
             if any((frame in grip) != (frame - 1 in grip) for grip in grips):
                 return 0.0
-            before, after = tool.tip_centre(np.array([frame - 1, frame]) / rate)
+            before, after = tool.path_at(np.array([frame - 1, frame]) / rate)
             change += math.dist(before, after) / max(tool.path_length, 1e-300)
         return change
 

@@ -32,7 +32,7 @@ from taichi_msm.model import tool_force
 from taichi_msm.model.plan import Plan
 from taichi_msm.model.sheet import spacing
 from taichi_msm.model.tool_force import ProbeRecord
-from taichi_msm.model.tools import COARSE_TIP_PHRASE, MAX_POINTS_RATIO, path_warnings, reaches_sheet, touching_tools
+from taichi_msm.model.tools import COARSE_TIP_PHRASE, MAX_POINTS_RATIO, path_warnings, solid_tools
 from taichi_msm.scene.section import MAX_POINTS
 from taichi_msm.scene.sheet import Foundation
 from taichi_msm.solver.dynamics import Dynamics
@@ -166,9 +166,9 @@ class RunErrorEstimator:
             known = known._replace(time_step=estimate)
         if self._mesh is not None:
             known = known._replace(mesh=self._mesh.estimate)
-            idle = [tool for tool, force in zip(self._plan.tools, self._max_force, strict=True) if not force]
             # A tool that passes between the mass points, and not one that stays clear of the sheet.
-            if any(reaches_sheet(tool, self._plan.scene) for tool in touching_tools(idle)):
+            idle = [tool for n, tool in solid_tools(self._plan.tools).items() if not self._max_force[n]]
+            if any(tool.reaches(self._plan.scene) for tool in idle):
                 known = known._replace(mesh=MeshEstimate(math.inf, NO_CONTACT))
             elif self._plan.has_contact and known.time_step is not None and known.time_step.error > MAX_DIFFERENCE:
                 known = known._replace(mesh=MeshEstimate(math.inf, LARGE_STEP_ERROR))
@@ -188,7 +188,7 @@ class RunErrorEstimator:
         if relative > FORCE_ERROR_FACTOR * MAX_DIFFERENCE:
             return ForceEstimate(None, NOT_CONVERGED)
         smallest = MIN_FORCE_ERROR_FACTOR * mesh.error
-        if radii := [tool.radius for tool in self._plan.tools if tool.grips]:
+        if radii := [tool.radius for tool in solid_tools(self._plan.tools).values() if tool.grips]:
             smallest = min(smallest, GRIP_FORCE_ERROR_FACTOR * max(spacing(self._plan.scene.sheet)) / min(radii))
         relative = max(relative, smallest)
         if not self._plan.has_contact:

@@ -182,7 +182,7 @@ def build_store(code: KernelConfig, *, parallel: bool) -> Callable[..., None]:
     Unless `parallel`, a single thread runs the steps of all workers in turn.
     """
     real, vector, vectors = code.real, code.vector, code.vectors
-    count_of_numbers, fill_halo, step = code.first_constant(None), build_fill_halo(code), build_point_step(code)
+    count_of_numbers, fill_halo, step = code.constants().end, build_fill_halo(code), build_point_step(code)
     storing = _build_store_moments(code)
 
     @ti.func
@@ -247,7 +247,7 @@ def build_store(code: KernelConfig, *, parallel: bool) -> Callable[..., None]:
 
 def _build_sweep_row(code: KernelConfig) -> Callable[..., None]:
     """Build the function that sweeps a row of a band."""
-    vector, columns, springs = code.vector, code.first_column(None), code.require(SpringTerm)
+    vector, columns, springs = code.vector, code.columns().end, code.require(SpringTerm)
     structural, shear, tension = springs.structural, springs.shear, springs.tense
     differentiate = springs.build_spring_tangent(code)
     mobility, area_share, _ = build_point_functions(code)
@@ -258,7 +258,7 @@ def _build_sweep_row(code: KernelConfig) -> Callable[..., None]:
     laplacians = [] if code.get(BendingTerm) is None else [build_laplacian(code)]
     add_load_derivatives = probes.build_load_adjoint(code, SUM_PARTS)
     slots, stationary = len(probes.moves), probes.moves.count(False)
-    foundation = code.first_column(FoundationTerm) if foundation_term else 0
+    foundation = code.columns(FoundationTerm).stiffness if foundation_term else 0
     foundation_derivatives = [foundation_term.build_derivatives(code)] if foundation_term else []
     stiffness_functions = [foundation_term.build_stiffness(code)] if foundation_term and foundation_term.law else []
     law, foundation_law = springs.law, foundation_term.law if foundation_term else None
@@ -397,7 +397,7 @@ def _build_sweep_row(code: KernelConfig) -> Callable[..., None]:
 @cache
 def build_sweep(code: KernelConfig, *, parallel: bool) -> Callable[..., None]:
     """Build the kernel that sweeps the adjoint, from the last step to the first; `parallel` as in `build_store`."""
-    real, vector, vectors, count_of_numbers = code.real, code.vector, code.vectors, code.first_constant(None)
+    real, vector, vectors, count_of_numbers = code.real, code.vector, code.vectors, code.constants().end
     fill_halo, storing = build_fill_halo(code), _build_store_moments(code)
     sweep_row = _build_sweep_row(code)
 

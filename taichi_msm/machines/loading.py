@@ -21,7 +21,7 @@ import numpy as np
 
 from taichi_msm.errors import SceneError
 from taichi_msm.machines.reader import Array, MachineTest
-from taichi_msm.model.tools import Clamp, Tool, build_tools, gap_to_sheet
+from taichi_msm.model.tools import SolidTool, build_tools, solid_tools
 from taichi_msm.scene.scene import Scene
 
 # Default frames per second, and largest number of frames at this default.
@@ -79,32 +79,33 @@ def find_approach(scene: Scene) -> Approach:
         fault = f"{len(tools)} position-controlled tools, but a machine test has one"
         raise SceneError([f"probes: {fault}; give exactly one probe a path, with an instrument or a clamp"])
     (tool,) = tools
-    key, offsets = f"probes.{tool.probe}.path", tool.tip_centres - tool.tip_centres[0]
+    key, offsets = f"probes.{tool.probe}.path", tool.path - tool.path[0]
     farthest = offsets[np.linalg.norm(offsets, axis=1).argmax()]
     if not farthest.any():
         raise SceneError([f"{key}: does not move; add a key in the direction of the test"])
     direction = farthest / np.linalg.norm(farthest)
-    is_clamp = isinstance(tool, Clamp)
-    start = np.zeros(3) if is_clamp else _first_contact(tool, direction, scene)
+    start: Array | None = np.zeros(3)
+    solids, tip_height = solid_tools(tools), 0.0
+    for solid in solids.values():
+        start, tip_height = _first_contact(solid, direction, scene), float(solid.path[0, 2] - solid.heights[0])
     if start is None:
         raise SceneError(
             [f"{key}: the line from its first to its farthest key misses the sheet; direct it at the sheet"]
         )
-    tip_height = float(tool.tip_centres[0, 2] - tool.heights[0])
-    return Approach(tool.probe, start, direction, tip_height, scene.sheet.size, is_clamp)
+    return Approach(tool.probe, start, direction, tip_height, scene.sheet.size, is_clamp=not solids)
 
 
-def _first_contact(tool: Tool, direction: Array, scene: Scene) -> Array | None:
+def _first_contact(tool: SolidTool, direction: Array, scene: Scene) -> Array | None:
     """Return the centre of the tip at first contact [m], shape (3,), or None if the tool misses the sheet."""
-    start, tolerance = tool.tip_centres[0], 1e-9 * tool.radius
+    start, tolerance = tool.path[0], 1e-9 * tool.radius
     travel, reach = 0.0, float(np.linalg.norm(start)) + tool.length + math.hypot(*scene.sheet.size)
     # Sphere tracing: the tool advances by its gap to the sheet. The gap of a tilted plate is approximate, so the tool
     # may have to go back.
-    goes_back, tip_height = False, tool.tip_centres[0, 2] - tool.heights[0]
+    goes_back, tip_height = False, tool.path[0, 2] - tool.heights[0]
     for _ in range(1000):
         centre = start + travel * direction
-        placed = replace(tool, times=np.zeros(1), tip_centres=centre[None], heights=centre[2:] - tip_height)
-        gap = gap_to_sheet(placed, scene.sheet)
+        placed = replace(tool, times=np.zeros(1), path=centre[None], heights=centre[2:] - tip_height)
+        gap = placed.gap(scene.sheet)
         if abs(gap) <= tolerance or (goes_back and gap > 0):
             return np.asarray(centre)
         goes_back = goes_back or gap < 0

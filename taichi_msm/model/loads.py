@@ -41,12 +41,8 @@ class Schedule(NamedTuple):
 def decay(probe: Probe, plan: Plan, at: Array | None = None) -> Array:
     """Return the decay factor of a probe's force at each mass point, shape (rows, cols).
 
-    The factor of a probe with `total` includes the mass point's share of a cell's area.
-
-    Args:
-        probe: force-controlled probe.
-        plan: supplies the rest positions and the areas of the mass points.
-        at: control point, x and y at rest [m], shape (2,); by default the first keyframe of `probe.at`.
+    The factor of a probe with `total` includes the mass point's share of a cell's area. The control point is `at`, x
+    and y at rest [m], or by default the first keyframe of `probe.at`.
     """
     sheet = plan.scene.sheet
     law, (at_x, at_y) = probe_force(probe, sheet), control_points(probe, sheet)[1][0] if at is None else at
@@ -59,11 +55,6 @@ def decay_gradient(probe: Probe, plan: Plan, at: Array | None = None) -> Array:
     """Return the derivatives of `decay` by x and y of the control point [1/m], shape (2, rows, cols).
 
     A mass point at the control point has the derivative 0; the decay has none there.
-
-    Args:
-        probe: force-controlled probe.
-        plan: supplies the rest positions and the areas of the mass points.
-        at: control point, x and y at rest [m], shape (2,); by default the first keyframe of `probe.at`.
     """
     sheet = plan.scene.sheet
     law, (at_x, at_y) = probe_force(probe, sheet), control_points(probe, sheet)[1][0] if at is None else at
@@ -75,13 +66,7 @@ def decay_gradient(probe: Probe, plan: Plan, at: Array | None = None) -> Array:
 
 
 def average_loads(plan: Plan, first: int, count: int) -> Schedule:
-    """Return the loads of consecutive steps, averaged with the hat function of each step.
-
-    Args:
-        plan: supplies the probes, their slots and the step.
-        first: number of the first step.
-        count: number of consecutive steps.
-    """
+    """Return the loads of `count` steps from the step `first` on, averaged with the hat function of each step."""
     scene, slots = plan.scene, plan.slots
     t, h = np.arange(first, first + count) / plan.grid.steps_per_second, plan.grid.step
     strength, point = np.zeros((count, len(slots), 3)), np.zeros((count, len(slots), 2))
@@ -102,14 +87,9 @@ def average_loads(plan: Plan, first: int, count: int) -> Schedule:
 
 
 def evaluate_loads(plan: Plan, t: Array) -> Schedule:
-    """Evaluate the loads without averaging, with one slot per probe.
+    """Evaluate the loads at times [s], shape (n,), without averaging; at a jump they are those after it.
 
-    Args:
-        plan: supplies the probes.
-        t: times [s], shape (n,); at a jump the loads are those after it.
-
-    Returns:
-        Loads at these times; the first axis of its arrays is (n,) instead of (steps,).
+    Each probe has one slot, and the arrays of the result have the first axis (n,).
     """
     scene = plan.scene
     slots = plan.slots if scene.time.at_rest else probe_slots(scene.probes, scene.sheet, 0.0)
@@ -125,15 +105,7 @@ def evaluate_loads(plan: Plan, t: Array) -> Schedule:
 
 
 class FrameLoad:
-    """The load of a force-controlled probe at frames, without averaging.
-
-    Args:
-        probe: force-controlled probe.
-        sheet: supplies the size that converts `probe.at` to metres.
-
-    Attributes:
-        moves: whether the control point moves.
-    """
+    """The load of a force-controlled probe at frames, without averaging; `moves` if its control point moves."""
 
     def __init__(self, probe: Probe, sheet: Sheet) -> None:
         self._line, (self._times, self._points) = _load(probe), control_points(probe, sheet)
@@ -141,14 +113,7 @@ class FrameLoad:
         self._keys = np.unique(np.concatenate([self._line.times, self._times]))
 
     def at(self, frame: int, rate: float) -> tuple[float, Array]:
-        """Return the load [%] and the control point, x and y at rest [m], shape (2,), at a frame.
-
-        At a jump these are the values after it.
-
-        Args:
-            frame: number of the frame.
-            rate: frames per second [1/s].
-        """
+        """Return the load [%] and the control point, x and y at rest [m], at a frame; at a jump, those after it."""
         time = frame / rate
         # Frame times are rounded, so a keyframe very close to the frame counts as at the frame.
         key = float(self._keys[max(0, self._keys.searchsorted(time + FRAME_TOLERANCE / rate, "right") - 1)])
@@ -162,10 +127,6 @@ def evaluate_frame_loads(plan: Plan, frame: int) -> Schedule:
     At a jump the loads are those after it. A keyframe within FRAME_TOLERANCE frames counts as at the frame. A
     foundation with `foundation_active: loaded` is active if any load differs from 0, or if any path has begun and not
     ended.
-
-    Args:
-        plan: supplies the probes and the frame rate.
-        frame: number of the frame.
     """
     scene, rate = plan.scene, plan.grid.frames_per_second
     time = frame / rate
@@ -201,15 +162,10 @@ class LoadBounds:
         self._begins = self._activity.times[self._activity.before < self._activity.after]
 
     def between(self, begin: float, end: float) -> tuple[Array, bool, int]:
-        """Bound the loads of all steps in a closed time interval.
+        """Bound the loads of all steps in a closed time interval [s].
 
-        Args:
-            begin: start of the interval [s].
-            end: end of the interval [s].
-
-        Returns:
-            Largest force at the control point of each slot [N], shape (slots,); whether the virtual springs are active
-            at any time; and the number of their activations.
+        Return the largest force at the control point of each slot [N], shape (slots,); whether the virtual springs are
+        active at any time; and the number of their activations.
         """
         # The hat of a step extends one step beyond the interval.
         begin, end = begin - self._h, end + self._h
@@ -221,11 +177,7 @@ class LoadBounds:
 class _PiecewiseLinear:
     """A piecewise linear function of time [s], 0 before the first keyframe and constant after the last.
 
-    It jumps where two keyframes have the same time.
-
-    Args:
-        times: ascending times of the keyframes [s], shape (n,).
-        values: values at the keyframes, shape (n,).
+    It jumps where two of the ascending times have the same value.
     """
 
     def __init__(self, times: Array, values: Array) -> None:

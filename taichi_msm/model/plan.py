@@ -13,7 +13,7 @@ from taichi_msm.integrators import Coefficients
 from taichi_msm.model.sheet import Maps, Material, has_fixed_border, point_areas
 from taichi_msm.model.time_grid import TimeGrid
 from taichi_msm.model.tool_force import control_points
-from taichi_msm.model.tools import Clamp, Tool, build_tools, touching_tools
+from taichi_msm.model.tools import Tool, build_tools, clamps, solid_tools
 from taichi_msm.scene.scene import Scene
 from taichi_msm.scene.sheet import Sheet
 from taichi_msm.scene.tools import Probe
@@ -58,10 +58,7 @@ class ProbeSlot:
 def probe_slots(probes: Sequence[Probe], sheet: Sheet, h: float) -> tuple[ProbeSlot, ...]:
     """Return the slots of all force-controlled probes, in the order of the probes.
 
-    Args:
-        probes: all probes of a scene; position-controlled tools have no slots.
-        sheet: supplies the size that converts `probe.at` to metres.
-        h: half-width of the hat, equal to the time step [s]; 0 for loads without averages, with one slot per probe.
+    The half-width h of the hat is the time step [s], or 0 for loads without averages, with one slot per probe.
     """
     slots = []
     for index, probe in enumerate(probes):
@@ -78,12 +75,7 @@ def probe_slots(probes: Sequence[Probe], sheet: Sheet, h: float) -> tuple[ProbeS
 
 
 def build_slots(scene: Scene, grid: TimeGrid) -> tuple[ProbeSlot, ...]:
-    """Return the slots of a scene's probes, in their order, one per probe in a quasi-static scene.
-
-    Args:
-        scene: supplies the probes and the kind of motion.
-        grid: supplies the step, the half-width of the hat.
-    """
+    """Return the slots of a scene's probes, in their order, one per probe in a quasi-static scene."""
     return probe_slots(scene.probes, scene.sheet, 0.0 if scene.time.at_rest else grid.step)
 
 
@@ -124,12 +116,12 @@ class Plan:
     @property
     def is_held(self) -> bool:
         """Whether any mass point is fixed or clamped."""
-        return bool(self.fixed.any()) or any(isinstance(tool, Clamp) for tool in self.tools)
+        return bool(self.fixed.any()) or bool(clamps(self.tools))
 
     @property
     def has_contact(self) -> bool:
         """Whether mass points can meet and leave a tool."""
-        return bool(touching_tools(self.tools))
+        return bool(solid_tools(self.tools))
 
     @property
     def step_coefficients(self) -> Coefficients:
@@ -150,11 +142,7 @@ class Plan:
         return replace(self, grid=grid, slots=build_slots(self.scene, grid))
 
     def with_probes(self, probes: Sequence[Probe | Mapping[str, Any]]) -> Plan:
-        """Return a copy with other probes, each a `Probe` or a mapping of its keys.
-
-        Raises:
-            SceneError: when a mapping is not a valid probe.
-        """
+        """Return a copy with other probes, each a `Probe` or a mapping of its keys; a SceneError if one is invalid."""
         scene = self.scene.model_copy(update={"probes": tuple(probes)})
         tools = build_tools(scene.probes, scene.sheet)
         return replace(self, scene=scene, slots=build_slots(scene, self.grid), tools=tools)

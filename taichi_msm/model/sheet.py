@@ -144,36 +144,20 @@ class Material:
 
 
 def read_map(stiffness_map: StiffnessMap) -> MapImage:
-    """Read the image of a stiffness map.
-
-    Raises:
-        PictureError: when the file is missing, unreadable or not a grey image.
-    """
+    """Read the image of a stiffness map; a PictureError reports a file that is not a readable grey image."""
     sha256 = file_sha256(stiffness_map.image)
     (grey,) = cached_arrays(("map", sha256), lambda: (read_grey(stiffness_map.image, sha256),))
     return MapImage(grey, sha256)
 
 
 def cell_factors(stiffness_map: StiffnessMap, image: MapImage, sheet: Sheet) -> Array:
-    """Return the factors of a stiffness map at the centres of the cells, shape (rows - 1, cols - 1).
-
-    Args:
-        stiffness_map: supplies the factors of black and white.
-        image: image of the map.
-        sheet: supplies the numbers of cells.
-    """
+    """Return the factors of a stiffness map at the centres of the cells, shape (rows - 1, cols - 1)."""
     rows, cols = (count - 1 for count in sheet.points)
     return map_factors(stiffness_map, image, (np.arange(rows) + 0.5) / rows, (np.arange(cols) + 0.5) / cols)
 
 
 def point_factors(stiffness_map: StiffnessMap, image: MapImage, sheet: Sheet) -> Array:
-    """Return the factors of a stiffness map at the mass points, shape (rows, cols).
-
-    Args:
-        stiffness_map: supplies the factors of black and white.
-        image: image of the map.
-        sheet: supplies the numbers of mass points.
-    """
+    """Return the factors of a stiffness map at the mass points, shape (rows, cols)."""
     rows, cols = (np.arange(count) / (count - 1) for count in sheet.points)
     return map_factors(stiffness_map, image, rows, cols)
 
@@ -181,11 +165,7 @@ def point_factors(stiffness_map: StiffnessMap, image: MapImage, sheet: Sheet) ->
 def map_factors(stiffness_map: StiffnessMap, image: MapImage, rows: Array, cols: Array) -> Array:
     """Return the factors of a stiffness map, bilinear between pixel centres, constant beyond them, shape (m, n).
 
-    Args:
-        stiffness_map: supplies the factors of black and white.
-        image: image of the map.
-        rows: distances of the sampled rows from the top, as fractions of the height, shape (m,).
-        cols: distances of the sampled columns from the left, as fractions of the width, shape (n,).
+    `rows`, shape (m,), and `cols`, shape (n,), are fractions of the height from the top and of the width from the left.
     """
     grey = image.grey.astype(float)
     height, width = grey.shape
@@ -261,13 +241,7 @@ def material_key_problems(scene: Scene) -> Iterator[Problem]:
 
 
 def tissue_problems(scene: Scene, fixed: NDArray[np.bool_], factors: Array | None) -> Iterator[Problem]:
-    """Yield problems of impossible values of keys of tissue.
-
-    Args:
-        scene: scene for which `material_key_problems` yields nothing.
-        fixed: whether each mass point is fixed, shape (rows, cols).
-        factors: stiffness factors of the cells, shape (rows - 1, cols - 1); None without a readable map.
-    """
+    """Yield problems of values of tissue, with stiffness factors of shape (rows - 1, cols - 1) if a map is readable."""
     tissue, sheet = scene.tissue, scene.sheet
     if tissue is None:
         return

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from taichi_msm.model.sheet import axes
 from taichi_msm.model.tool_force import control_point
-from taichi_msm.model.tools import build_tools, unit_vector
+from taichi_msm.model.tools import build_tools, solid_tools, unit_vector
 from taichi_msm.scene.scene import Scene
 from taichi_msm.scene.sheet import Sheet
 from taichi_msm.scene.tools import Instrument
@@ -20,15 +20,7 @@ Array = NDArray[np.float64]
 
 
 def to_positions(displacement: NDArray[Any], sheet: Sheet) -> NDArray[Any]:
-    """Convert displacements to positions, in place.
-
-    Args:
-        displacement: displacements of the mass points [m], shape (rows, cols, 3), overwritten with positions.
-        sheet: supplies the rest positions.
-
-    Returns:
-        The same array, now read-only: positions [m].
-    """
+    """Convert displacements [m], shape (rows, cols, 3), to positions in place, and make the array read-only."""
     position, (x, y) = displacement, axes(sheet)
     # The sum is computed in float64 and rounded once, without a float64 copy of the sheet.
     np.add(position[..., 0], x, out=position[..., 0], casting="same_kind")
@@ -38,18 +30,10 @@ def to_positions(displacement: NDArray[Any], sheet: Sheet) -> NDArray[Any]:
 
 
 def surface_point(position: NDArray[np.floating], refine: int, sheet: Sheet, rest: Array) -> tuple[Array, Array]:
-    """Find the point of the refined surface with a given rest position.
+    """Find the point of the refined surface with a given rest position, x and y [m].
 
-    A point outside the sheet moves with the nearest point of the sheet's edge.
-
-    Args:
-        position: positions of the mass points [m], shape (rows, cols, 3).
-        refine: number of vertices inserted between neighbouring mass points.
-        sheet: supplies the size.
-        rest: rest position, x and y [m], shape (2,).
-
-    Returns:
-        The point [m], shape (3,), and the unit normal of the surface there, upward at rest, shape (3,).
+    Return the point [m] and the unit normal of the surface there, upward at rest, shape (3,) each. A point outside the
+    sheet moves with the nearest point of the sheet's edge. `refine` vertices lie between neighbouring mass points.
     """
     height, width = sheet.size
     across = min(1.0, max(0.0, rest[0] / width + 0.5))
@@ -62,24 +46,15 @@ def surface_point(position: NDArray[np.floating], refine: int, sheet: Sheet, res
 def surface_positions(position: NDArray[np.floating], refine: int, coordinates: NDArray[np.floating]) -> Array:
     """Return the positions of material points on the refined surface [m], shape (n, 3).
 
-    Args:
-        position: positions of the mass points [m], shape (rows, cols, 3).
-        refine: number of vertices inserted between neighbouring mass points.
-        coordinates: fractions of the sheet's width from its left and of its height from its top, shape (n, 2).
+    Their coordinates, shape (n, 2), are fractions of the sheet's width from its left and of its height from its top.
     """
     return _interpolate(position, refine, coordinates.astype(np.float64))[0]
 
 
 def surface_weights(coordinates: Array, sheet: Sheet, refine: int) -> tuple[NDArray[np.intp], Array]:
-    """Compute the weights of mass points in `surface_positions`.
+    """Return the four mass points around each point of `surface_positions`, and their weights, shape (n, 4) each.
 
-    Args:
-        coordinates: fractions of the sheet's width from its left and of its height from its top, shape (n, 2).
-        sheet: supplies the numbers of mass points.
-        refine: number of vertices inserted between neighbouring mass points.
-
-    Returns:
-        Indices of the four mass points around each point, numbered row by row, and their weights, both of shape (n, 4).
+    Mass points are numbered row by row.
     """
     cols = sheet.points[1]
     i, j, s, t, twist = _cell_coordinates(coordinates, sheet.points, refine)
@@ -134,10 +109,6 @@ def refine_surface(position: NDArray[np.floating], refine: int) -> Surface:
     """Return the triangles of the sheet after bilinear refinement (section 2 of the paper).
 
     Every small quad is divided by the diagonal from top left to bottom right.
-
-    Args:
-        position: positions of the mass points [m], shape (rows, cols, 3).
-        refine: number of vertices inserted between neighbouring mass points.
     """
     vertices = _insert(_insert(position, refine, 0), refine, 1)
     rows, cols = vertices.shape[:2]
@@ -155,21 +126,15 @@ def refine_surface(position: NDArray[np.floating], refine: int) -> Surface:
 
 
 def place_instruments(scene: Scene, position: NDArray[np.floating], time: float) -> list[Solid]:
-    """Return a solid for every probe with an instrument, in the order of the probes.
-
-    Args:
-        scene: supplies the probes.
-        position: positions of the mass points at this time [m], shape (rows, cols, 3).
-        time: time [s].
-    """
-    moved = {tool.probe: tool for tool in build_tools(scene.probes, scene.sheet)}
+    """Return a solid for every probe with an instrument at a time [s], in the order of the probes."""
+    moved = {tool.probe: tool for tool in solid_tools(build_tools(scene.probes, scene.sheet)).values()}
     placed = []
     for index, probe in enumerate(scene.probes):
         if probe.instrument is None:
             continue
         if index in moved:
             tool = moved[index]
-            tip = tool.tip_centre(np.array([time]))[0]
+            tip = tool.path_at(np.array([time]))[0]
             placed.append(Solid(tip, tool.axis, tool.length, tool.radius, tool.shape))
         else:
             placed.append(place_instrument(probe.instrument, scene, position, control_point(probe, scene.sheet, time)))
@@ -177,16 +142,9 @@ def place_instruments(scene: Scene, position: NDArray[np.floating], time: float)
 
 
 def place_instrument(instrument: Instrument, scene: Scene, position: NDArray[np.floating], rest: Array) -> Solid:
-    """Place the instrument of a force-controlled probe on the deformed surface.
+    """Place the instrument of a force-controlled probe above the material point at rest at x and y [m].
 
-    Args:
-        instrument: shape, radius and shaft.
-        scene: supplies the sheet and its refinement.
-        position: positions of the mass points [m], shape (rows, cols, 3).
-        rest: rest position of the material point below the tip, x and y [m], shape (2,).
-
-    Returns:
-        The instrument, with its tip on the side of the surface to which the shaft points.
+    Its tip is on the side of the deformed surface to which the shaft points.
     """
     axis = unit_vector(instrument.shaft)
     point, normal = surface_point(position, scene.render.refine, scene.sheet, rest)

@@ -52,12 +52,7 @@ class ProbeForce(NamedTuple):
 
 
 def probe_force(probe: Probe, sheet: Sheet) -> ProbeForce:
-    """Return the force law of a force-controlled probe.
-
-    Args:
-        probe: force-controlled probe.
-        sheet: supplies the area of a cell, which scales a `total`.
-    """
+    """Return the force law of a force-controlled probe; the area of the sheet's cells scales a `total`."""
     rim = probe.falloff * probe.radius
     if probe.total is None:
         assert probe.force is not None
@@ -69,12 +64,7 @@ def probe_force(probe: Probe, sheet: Sheet) -> ProbeForce:
 
 
 def control_points(probe: Probe, sheet: Sheet) -> tuple[Array, Array]:
-    """Return the keyframes of a control point: times [s], shape (n,), and x and y at rest [m], shape (n, 2).
-
-    Args:
-        probe: force-controlled probe.
-        sheet: supplies the size that converts `probe.at` to metres.
-    """
+    """Return the keyframes of a control point: times [s], shape (n,), and x and y at rest [m], shape (n, 2)."""
     first = probe.at[0]
     keys = probe.at if isinstance(first, tuple) else ((0.0, *probe.at),)
     time, across, down = np.array(keys, dtype=float).T
@@ -83,24 +73,12 @@ def control_points(probe: Probe, sheet: Sheet) -> tuple[Array, Array]:
 
 
 def control_point(probe: Probe, sheet: Sheet, time: float) -> Array:
-    """Return a probe's control point, x and y at rest [m], shape (2,); at a jump, the point after the jump.
-
-    Args:
-        probe: force-controlled probe.
-        sheet: supplies the size that converts `probe.at` to metres.
-        time: time [s].
-    """
+    """Return a probe's control point, x and y at rest [m], shape (2,); at a jump, the point after the jump."""
     return point_at(*control_points(probe, sheet), time)
 
 
 def point_at(times: Array, points: Array, time: float) -> Array:
-    """Return a control point [m], shape (2,), interpolated between keyframes; at a jump, the point after the jump.
-
-    Args:
-        times: ascending times of the keyframes [s], shape (n,).
-        points: control points at the keyframes [m], shape (n, 2).
-        time: time [s].
-    """
+    """Interpolate between the control points of keyframes [m], shape (n, 2); at a jump, return the point after it."""
     # A keyframe later than the time by a rounding error counts as reached.
     after = int(np.searchsorted(times, time + 1e-12 * max(1.0, abs(time)), side="right"))
     if after in (0, len(times)):
@@ -119,13 +97,8 @@ def _decay_integral(probe: Probe) -> float:
 def sum_probe_forces(probe: Probe, sheet: Sheet, refinement: int = 1) -> tuple[float, float]:
     """Sum the forces of a probe over all mass points, at 100 % and at its first control point.
 
-    Args:
-        probe: force-controlled probe.
-        sheet: supplies the size and the numbers of mass points.
-        refinement: factor by which the cells are divided along both axes.
-
-    Returns:
-        The sum [N], and the largest force on a mass point per area that belongs to it [Pa].
+    Return the sum [N], and the largest force on a mass point per area that belongs to it [Pa], for a sheet whose cells
+    are divided along both axes by the factor `refinement`.
     """
     law, (at_x, at_y) = probe_force(probe, sheet), control_points(probe, sheet)[1][0]
     (rows, cols), (height, width) = ((count - 1) * refinement for count in sheet.points), sheet.size
@@ -184,12 +157,7 @@ def describe_forces(record: ProbeRecord) -> str:
 
 
 def force_warnings(scene: Scene, records: Sequence[ProbeRecord]) -> Iterator[str]:
-    """Yield warnings of probes whose forces on this sheet do not add up to their `total`.
-
-    Args:
-        scene: supplies the probes and the sheet.
-        records: forces of all probes, from `probe_records`.
-    """
+    """Yield warnings of probes whose forces on this sheet, from `probe_records`, do not add up to their `total`."""
     across, down = spacing(scene.sheet)
     cell = f"a cell of {across:.3g} x {down:.3g} m"
     for index, (probe, record) in enumerate(zip(scene.probes, records, strict=True)):

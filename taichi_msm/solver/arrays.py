@@ -6,10 +6,7 @@ a halo of one entry at both ends. The rows are stored one after another in one-d
 take fewer instructions per index:
 
     u, d         displacements and last differences [m], as three arrays each, for x, y and z
-    by_column    COLUMN_ROWS rows of numbers per column (`terms.base`):
-                 MOBILITY: the inverse share of a cell's mass at a mass point, 0 if it is fixed; AREA_SHARE: its share
-                 of a cell's area; three rows each, for the first, a middle and the last row of the sheet
-                 REST_X: x at rest [m]; HAS_LEFT, HAS_RIGHT: 1 with a neighbour on this side, else 0
+    by_column    numbers per column, in the rows `terms.base.BY_COLUMN`
     fields       numbers per mass point, all rows of one field after those of another: mobility and area share unless
                  `by_column` has them, the rest position of a curved sheet, and the fields of the terms
     constants    of the sheet and its terms, each in the first lane of an entry
@@ -71,14 +68,10 @@ class InitialData(NamedTuple):
 
 
 def to_lanes(layout: SheetLayout, values: NDArray[Any]) -> NDArray[Any]:
-    """Arrange values in lanes with halo, in the precision of the kernels.
+    """Arrange values by column, shape (..., cols), in lanes with halo, in the precision of the kernels.
 
-    Args:
-        layout: layout of the sheet.
-        values: values by column, shape (..., cols); those too large for the precision become infinite.
-
-    Returns:
-        Entries, shape (entries, lanes), with `layout.width` entries per row; 0 in entries without a column.
+    The result has the shape (entries, lanes), with `layout.width` entries per row, and 0 in entries without a column.
+    Values too large for the precision become infinite.
     """
     column = np.arange(layout.config.lanes) * layout.strip + np.arange(-1, layout.strip + 1)[:, None]
     inside = (column >= 0) & (column < layout.cols)
@@ -89,13 +82,7 @@ def to_lanes(layout: SheetLayout, values: NDArray[Any]) -> NDArray[Any]:
 
 
 def from_lanes(layout: SheetLayout, entries: NDArray[Any], rows: int) -> NDArray[Any]:
-    """Return the values of entries by column, shape (rows, cols), the inverse of `to_lanes`.
-
-    Args:
-        layout: layout of the sheet.
-        entries: entries with halo, shape (entries, lanes), at least `rows` rows of them.
-        rows: number of rows.
-    """
+    """Return the values of entries by column, shape (rows, cols), the inverse of `to_lanes`."""
     by_row = entries[: rows * layout.width].reshape(rows, layout.width, layout.config.lanes)
     return by_row[:, 1:-1].transpose(0, 2, 1).reshape(rows, -1)[:, : layout.cols]
 
@@ -103,10 +90,7 @@ def from_lanes(layout: SheetLayout, entries: NDArray[Any], rows: int) -> NDArray
 class SheetArrays:
     """The arrays of a sheet in the memory of a device.
 
-    Args:
-        layout: layout of the sheet.
-        sheet_rows: index of the row of the sheet in each row of u; -1 for other content, shape (rows of u,).
-        start: initial values.
+    `sheet_rows` has the row of the sheet in each row of u, -1 for other content, shape (rows of u,).
     """
 
     def __init__(self, layout: SheetLayout, sheet_rows: NDArray[np.int32], start: InitialData) -> None:
@@ -147,12 +131,7 @@ class SheetArrays:
         return from_lanes(layout, self.fields.to_numpy()[index * layout.rows * layout.width :], layout.rows)
 
     def set_fields(self, first: int, values: NDArray[Any]) -> None:
-        """Replace consecutive fields of the terms.
-
-        Args:
-            first: index of the first field.
-            values: new values, shape (fields, rows, cols).
-        """
+        """Replace consecutive fields of the terms, from the index `first` on; values: shape (fields, rows, cols)."""
         entries, new = self.fields.to_numpy(), to_lanes(self._layout, values)
         at = first * self._layout.rows * self._layout.width
         entries[at : at + len(new)] = new
@@ -176,12 +155,9 @@ class SheetKernel:
     _top_row = 0  # row of u that contains the first row of the sheet
 
     def read(self, differences: bool, values: NDArray[Any], measures: NDArray[Any]) -> None:
-        """Read displacements or last differences (at rest, forces), and measure every row.
+        """Read displacements [m] or `differences`, at rest forces [N], into `values`, shape (rows, cols, 3).
 
-        Args:
-            differences: whether to read last differences instead of displacements.
-            values: output [m], at rest of forces [N], shape (rows, cols, 3).
-            measures: output, shape (rows, measures).
+        `measures`, shape (rows, measures), receives the measures of every row.
         """
         layout = self._layout
         with compilation_options():
@@ -193,12 +169,7 @@ class StepKernel(SheetKernel, ABC):
 
     @abstractmethod
     def advance(self, count: int, table: NDArray[Any]) -> None:
-        """Advance the sheet.
-
-        Args:
-            count: number of steps.
-            table: rows of the load table for these steps, shape (count, columns).
-        """
+        """Advance the sheet by `count` steps, with their rows of the load table, shape (count, columns)."""
 
     @abstractmethod
     def compile(self, table: NDArray[Any]) -> None:
@@ -241,19 +212,12 @@ def build_point_step(config: KernelConfig) -> Callable[..., None]:
 
 @cache
 def build_read(config: KernelConfig, *, parallel: bool, iterations: int) -> Callable[..., None]:
-    """Build the kernel that reads and measures a sheet.
+    """Build the kernel of `SheetKernel.read`, which distributes the rows over threads if `parallel`.
 
-    Args:
-        config: compile-time configuration.
-        parallel: whether to distribute the rows over threads.
-        iterations: iterations of the loop per row, of which the first does the work: ITERATIONS_PER_THREAD for one row
-            per CPU thread.
-
-    Returns:
-        The kernel `read`, see `SheetKernel.read`.
+    Of the `iterations` of the loop per row, the first does the work: ITERATIONS_PER_THREAD for one row per CPU thread.
     """
     real, vector, vectors, lanes = config.real, config.vector, config.vectors, config.lanes
-    count, area_share = config.first_constant(None), build_point_functions(config).area_share
+    count, area_share = config.constants().end, build_point_functions(config).area_share
     measuring = [measure for term in config.terms for measure in term.build_measures(config)]
     reductions = ["sum", *(reduction for term in config.terms for reduction in term.reductions)]
 
@@ -265,17 +229,7 @@ def build_read(config: KernelConfig, *, parallel: bool, iterations: int) -> Call
         d_x: vectors, d_y: vectors, d_z: vectors,
         constants_of: ti.types.ndarray(dtype=vector, ndim=1), by_column: vectors, fields: vectors,
     ):  # fmt: skip
-        """Read and measure a sheet.
-
-        Args:
-            first: row of u that contains the first row of the sheet.
-            rows: number of rows of the sheet.
-            cols: number of columns of the sheet.
-            differences: whether to read d instead of u.
-            values: output [m], shape (rows, cols, 3).
-            measures: output, shape (rows, measures).
-            u_x, u_y, u_z, d_x, d_y, d_z, constants_of, by_column, fields: `SheetArrays.all`.
-        """
+        """Read and measure a sheet, whose first row is row `first` of u, see `SheetKernel.read`."""
         ti.loop_config(serialize=not parallel)
         for index in range(rows * iterations):
             if index % iterations == 0:

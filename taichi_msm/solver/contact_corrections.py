@@ -11,34 +11,29 @@ from numpy.typing import NDArray
 from taichi_msm.solver.arrays import SheetArrays, SheetLayout
 from taichi_msm.system.runtime import compilation_options, ti
 from taichi_msm.terms.base import KernelConfig, KernelSheet
-from taichi_msm.terms.contact import CORRECTIONS, ContactTerm
+from taichi_msm.terms.contact import ContactTerm
 from taichi_msm.terms.points import build_point_functions
 
 
 def sum_corrections(layout: SheetLayout, arrays: SheetArrays, *, clear: bool) -> NDArray[np.float64]:
     """Return the sums of the contact corrections [m], weighted with shares of a cell's mass, shape (tools, 3).
 
-    The order of summation depends neither on lanes nor on workers.
-
-    Args:
-        layout: layout of the sheet.
-        arrays: arrays of the sheet.
-        clear: whether to set the corrections to 0 afterwards.
+    The order of summation depends neither on lanes nor on workers. With `clear`, the corrections are then set to 0.
     """
     contact = layout.config.get(ContactTerm)
     if contact is None:
         return np.zeros((0, 3))
-    sums = np.empty((CORRECTIONS * len(contact.shapes), layout.rows))
+    sums = np.empty((3 * len(contact.shapes), layout.rows))
     with compilation_options():
         _build_sum(layout.config)(layout.rows, layout.cols, clear, arrays.by_column, arrays.fields, sums)
-    return sums.sum(axis=1).reshape(-1, CORRECTIONS)
+    return sums.sum(axis=1).reshape(-1, 3)
 
 
 @cache
 def _build_sum(config: KernelConfig) -> Callable[..., None]:
     """Build the kernel that sums the corrections in every row, per tool and component."""
     vector, vectors, lanes, serial = config.vector, config.vectors, config.lanes, config.lanes > 1
-    first, count = config.first_field(ContactTerm), CORRECTIONS * len(config.require(ContactTerm).shapes)
+    first, count = config.fields(ContactTerm).corrections[0].start, 3 * len(config.require(ContactTerm).shapes)
     by_area, area_share = config.by_area, build_point_functions(config).area_share
 
     @ti.kernel
@@ -46,16 +41,7 @@ def _build_sum(config: KernelConfig) -> Callable[..., None]:
         rows: ti.i32, cols: ti.i32, clear: ti.i32,
         by_column: vectors, fields_of: vectors, sums: ti.types.ndarray(dtype=ti.f64, ndim=2),
     ):  # fmt: skip
-        """Sum the corrections in every row from left to right.
-
-        Args:
-            rows: number of rows of the sheet.
-            cols: number of columns of the sheet.
-            clear: whether to set the corrections to 0 afterwards.
-            by_column: as in `SheetArrays`.
-            fields_of: `SheetArrays.fields`.
-            sums: output [m], shape (tools x 3, rows).
-        """
+        """Sum the corrections in every row from left to right into `sums` [m], shape (tools x 3, rows)."""
         fields = ti.static(fields_of)
         ti.loop_config(serialize=serial)
         for i in range(rows):

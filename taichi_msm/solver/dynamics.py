@@ -100,12 +100,7 @@ class Dynamics(SheetSolver[StepKernel]):
         return sums / (self.plan.step_coefficients.gain * self.plan.grid.steps_per_frame)
 
     def step_table(self, first: int, count: int) -> NDArray[Any]:
-        """Return the load table of consecutive steps, shape (count, columns).
-
-        Args:
-            first: number of the first step.
-            count: number of steps.
-        """
+        """Return the load table of `count` consecutive steps from the step `first` on, shape (count, columns)."""
         table = self._load_table(average_loads(self.plan, first, count), first)
         _, table[:, GAIN], first_gain = self.plan.step_coefficients
         if first == 0:
@@ -150,13 +145,9 @@ class ForceRecorder:
         return ProbeForces(forces, tuple(PeakForce(0.0, tip.force) for tip in forces))
 
     def at_frame(self, before: ProbeForces, frame: int, position: NDArray[Any], tool_forces: Array) -> ProbeForces:
-        """Return the forces at a frame and their maxima up to it.
+        """Return the forces at a frame and their maxima up to it, from those at the previous frame.
 
-        Args:
-            before: forces and maxima at the previous frame.
-            frame: number of the frame.
-            position: positions of the mass points [m], shape (rows, cols, 3).
-            tool_forces: forces of the position-controlled tools [N], shape (tools, 3), see `SheetSolver.tool_forces`.
+        The positions [m] have the shape (rows, cols, 3), the forces of `SheetSolver.tool_forces` [N] (tools, 3).
         """
         forces, time = self._forces(frame, position, tool_forces), frame / self._plan.grid.frames_per_second
         peaks = zip(before.greatest, (PeakForce(time, tip.force) for tip in forces), strict=True)

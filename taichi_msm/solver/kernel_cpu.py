@@ -30,12 +30,7 @@ MAX_CHECKS = round(1.32e-3 / active_compiler().poll_s)
 
 
 class ScatterKernel(StepKernel):
-    """A sheet in the memory of a CPU.
-
-    Args:
-        layout: layout of the sheet, with at least one worker.
-        start: initial values.
-    """
+    """A sheet in the memory of a CPU, with at least one worker."""
 
     def __init__(self, layout: SheetLayout, start: InitialData) -> None:
         self._layout = layout
@@ -121,13 +116,21 @@ class ScatterKernel(StepKernel):
 
     def _launch(self, kernel: Callable[..., None], workers: int, count: int, table: NDArray[Any]) -> None:
         layout = self._layout
-        # In the order of the constants in `bands`.
-        sizes = np.array([
-            self._steps, count, workers, layout.depth, self._carried_rows, layout.rows, layout.strip,
-            self._first_row, self._end_row, layout.rows + len(self._borders), MAX_CHECKS,
-        ])  # fmt: skip
+        sizes = bands.Launch(
+            steps_before=self._steps,
+            count=count,
+            workers=workers,
+            depth=layout.depth,
+            carried_rows=self._carried_rows,
+            rows=layout.rows,
+            strip=layout.strip,
+            first_row=self._first_row,
+            end_row=self._end_row,
+            moment_row=layout.rows + len(self._borders),
+            max_checks=MAX_CHECKS,
+        )
         with compilation_options():
-            kernel(sizes, self._progress, table, *self._carried, *self.arrays.all)
+            kernel(np.array(sizes), self._progress, table, *self._carried, *self.arrays.all)
         self._steps += count
 
     def _border_rows(self) -> NDArray[np.int32]:
@@ -154,14 +157,7 @@ def _build_copy(config: KernelConfig) -> Callable[..., None]:
         u_x: vectors, u_y: vectors, u_z: vectors,
         borders: ti.types.ndarray(dtype=ti.i32, ndim=1), rows: ti.i32, width: ti.i32,
     ):  # fmt: skip
-        """Copy rows of the sheet into the rows of u after it.
-
-        Args:
-            u_x, u_y, u_z: displacements [m].
-            borders: index of the sheet's row in each copy, shape (copies,).
-            rows: number of rows of the sheet.
-            width: number of entries of a row.
-        """
+        """Copy the rows `borders` of the sheet, shape (copies,), into the rows of u after it."""
         for n, b in ti.ndrange(borders.shape[0], width):
             for u in ti.static((u_x, u_y, u_z)):
                 u[(rows + n) * width + b] = u[borders[n] * width + b]

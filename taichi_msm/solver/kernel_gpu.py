@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from taichi_msm.solver.arrays import InitialData, SheetArrays, SheetLayout, StepKernel, build_point_step, build_read
 from taichi_msm.system.runtime import compilation_options, ti
-from taichi_msm.terms.base import DX, DY, HAS_LEFT, HAS_RIGHT, Entry, KernelConfig, KernelRow, KernelSheet, RowPair
+from taichi_msm.terms.base import BY_COLUMN, DX, DY, Entry, KernelConfig, KernelRow, KernelSheet, RowPair
 from taichi_msm.terms.bending import BendingTerm
 from taichi_msm.terms.springs import SpringTerm
 
@@ -24,12 +24,7 @@ STEPS_PER_LAUNCH = 8
 
 
 class GatherKernel(StepKernel):
-    """A sheet in the memory of a GPU; a launch takes at most STEPS_PER_LAUNCH steps.
-
-    Args:
-        layout: layout of the sheet, with one lane and without workers.
-        start: initial values.
-    """
+    """A sheet in the memory of a GPU, with one lane and no workers; a launch takes at most STEPS_PER_LAUNCH steps."""
 
     def __init__(self, layout: SheetLayout, start: InitialData) -> None:
         self._layout = layout
@@ -53,7 +48,7 @@ class GatherKernel(StepKernel):
 
 def _build_step(config: KernelConfig) -> Callable[..., None]:
     """Build the Taichi function that steps a mass point."""
-    real, vector, columns, springs = config.real, config.vector, config.first_column(None), config.require(SpringTerm)
+    real, vector, columns, springs = config.real, config.vector, config.columns().end, config.require(SpringTerm)
     structural, shear, open_edges = springs.structural, springs.shear, springs.open_edges
     force_on_right, force_on_other = springs.build_spring_forces(config)
     move, corrections = build_point_step(config), [term.build_correction(config) for term in config.terms]
@@ -68,7 +63,8 @@ def _build_step(config: KernelConfig) -> Callable[..., None]:
             if ti.static(structural if right == 0 else shear):
                 exists = vector(1)
                 if ti.static(right != 0 and open_edges):
-                    exists = sheet.by_column[ti.static(HAS_LEFT if right < 0 else HAS_RIGHT) * sheet.width + b]
+                    side = ti.static(BY_COLUMN.has_left if right < 0 else BY_COLUMN.has_right)
+                    exists = sheet.by_column[side * sheet.width + b]
                 pull = force_on_other(sheet, pair, q * sheet.width + b + right, right, b, u, exists * row_exists)
                 for c in ti.static(range(3)):
                     force[c] += pull[c]
@@ -79,7 +75,7 @@ def _build_step(config: KernelConfig) -> Callable[..., None]:
         """Return the force of entry b of row p of u on its right neighbour."""
         exists, entry = vector(1), p * sheet.width + b
         if ti.static(open_edges):
-            exists = sheet.by_column[HAS_RIGHT * sheet.width + b]
+            exists = sheet.by_column[BY_COLUMN.has_right * sheet.width + b]
         u = [sheet.u[c][entry] for c in ti.static(range(3))]
         return force_on_right(sheet, pair, entry + 1, b, u, exists)
 
@@ -118,7 +114,7 @@ def _build_step(config: KernelConfig) -> Callable[..., None]:
 @cache
 def _build_advance(config: KernelConfig) -> Callable[..., None]:
     """Build the kernel that takes steps."""
-    real, vector, vectors, constant_count = config.real, config.vector, config.vectors, config.first_constant(None)
+    real, vector, vectors, constant_count = config.real, config.vector, config.vectors, config.constants().end
     step, bending = _build_step(config), config.get(BendingTerm)
     storing = [bending.build_store_moment(config)] if bending else []
 
@@ -129,16 +125,7 @@ def _build_advance(config: KernelConfig) -> Callable[..., None]:
         d_x: vectors, d_y: vectors, d_z: vectors,
         constants_of: ti.types.ndarray(dtype=vector, ndim=1), by_column: vectors, fields: vectors,
     ):  # fmt: skip
-        """Advance by the steps of a launch.
-
-        Args:
-            buffer: index of the buffer with u_n, 0 or 1.
-            count: number of steps, at most STEPS_PER_LAUNCH.
-            rows: number of rows of the sheet.
-            cols: number of columns of the sheet.
-            loads: load table of the launch, shape (steps, columns).
-            u_x, u_y, u_z, d_x, d_y, d_z, constants_of, by_column, fields: `SheetArrays.all`.
-        """
+        """Advance by at most STEPS_PER_LAUNCH steps with a row of `loads` each, from u_n in `buffer` 0 or 1."""
         for n in ti.static(range(STEPS_PER_LAUNCH)):
             for store_moment in ti.static(storing):
                 for i, b in ti.ndrange((-1, rows + 1), cols + 2):

@@ -36,7 +36,7 @@ from taichi_msm.solver.arrays import (
     build_read,
     to_lanes,
 )
-from taichi_msm.solver.bands import MOMENT_ROWS, RowBand, build_fill_halo, build_step_row
+from taichi_msm.solver.bands import MOMENT_ROWS, BandStep, RowBand, build_fill_halo, build_step_row
 from taichi_msm.system.runtime import compilation_options, ti, write_vectors
 from taichi_msm.terms.base import Entry, KernelConfig, KernelRow, KernelSheet, RestCorrection
 from taichi_msm.terms.bending import BendingTerm
@@ -88,13 +88,7 @@ class RestSheet(NamedTuple):
 class Relaxation(SheetKernel):
     """A sheet in the memory of a CPU, and the kernels that find its equilibrium.
 
-    Args:
-        layout: layout of the sheet.
-        start: initial values.
-        masses: fictitious masses M [N/m], shape (rows, cols).
-
-    Attributes:
-        masses: as given.
+    Its fictitious masses M [N/m] have the shape (rows, cols).
     """
 
     def __init__(self, layout: SheetLayout, start: InitialData, masses: NDArray[Any]) -> None:
@@ -125,15 +119,9 @@ class Relaxation(SheetKernel):
         self.arrays.set_displacement(displacement)
 
     def relax(self, count: int, tolerance: float, row: NDArray[Any]) -> tuple[int, float]:
-        """Evaluate the forces and move the mass points until no force exceeds a tolerance.
+        """Evaluate the forces and move the mass points, at most `count` times, until no force exceeds a tolerance [N].
 
-        Args:
-            count: largest number of evaluations.
-            tolerance: largest force on a mass point [N].
-            row: row of the load table, shape (1, columns).
-
-        Returns:
-            Number of evaluations, and the largest force of the last one [N], infinite if any force is NaN.
+        Return the number of evaluations, and the largest force of the last one [N], infinite if any force is NaN.
         """
         fire = self._fire
         fire[[COUNT, SQUARED_TOLERANCE]] = count, tolerance * tolerance
@@ -192,10 +180,10 @@ def _build_store(config: KernelConfig) -> Callable[..., None]:
 def _build_relax(config: KernelConfig) -> Callable[..., None]:
     """Build the kernel that evaluates forces and moves mass points."""
     real, vector, vectors, lanes = config.real, config.vector, config.vectors, config.lanes
-    constant_count, fill_halo = config.first_constant(None), build_fill_halo(config)
+    constant_count, fill_halo = config.constants().end, build_fill_halo(config)
     step_row = build_step_row(config, _build_store(config), corrects=False, parallel=False)
     moments = 0 if config.get(BendingTerm) is None else MOMENT_ROWS
-    columns, corrections = config.first_column(None), _corrections(config)
+    columns, corrections = config.columns().end, _corrections(config)
     removals, projections = [each.remove for each in corrections], [each.project for each in corrections]
 
     @ti.func
@@ -212,8 +200,9 @@ def _build_relax(config: KernelConfig) -> Callable[..., None]:
         """Evaluate the forces on all mass points and their reductions."""
         for n in range(sheet.rows * sheet.width, (sheet.rows + SUMS) * sheet.width):
             sheet.work[n] = vector(0)
+        step = ti.static(BandStep(0, 0, sheet.rows + moments, sheet.rows))
         for line in range(-1, band.high - band.low):
-            step_row(sheet, sheet.u, row, band, line, 0, 0, sheet.rows + moments, sheet.rows)
+            step_row(sheet, sheet.u, row, band, step, line)
 
     @ti.func
     def move_points(sheet: ti.template(), row: ti.template(), band: ti.template(), keep, gain, dt, back):
@@ -256,12 +245,8 @@ def _build_relax(config: KernelConfig) -> Callable[..., None]:
     ):  # fmt: skip
         """Evaluate the forces and move the mass points, see `Relaxation.relax`.
 
-        Args:
-            fire: arguments, state of FIRE and results, in the order of ROWS, ..., FORCE_SUM, shape (NUMBERS,).
-            row: row of the load table, shape (1, columns).
-            q_x, q_y, q_z: momenta [N].
-            work: 1 / M of every mass point [m/N], followed by SUMS rows of reductions.
-            u_x, u_y, u_z, d_x, d_y, d_z, constants_of, by_column, fields: `SheetArrays.all`.
+        `fire` has arguments, state of FIRE and results, in the order of ROWS, ..., FORCE_SUM, and `row` is a row of the
+        load table. `work` has 1 / M of every mass point [m/N], followed by SUMS rows of reductions; q are momenta [N].
         """
         ti.loop_config(serialize=True)
         for _ in range(1):
@@ -271,7 +256,7 @@ def _build_relax(config: KernelConfig) -> Callable[..., None]:
             constants = [constants_of[n][0] for n in ti.static(range(constant_count))]
             u, forces, q = ti.static((u_x, u_y, u_z), (d_x, d_y, d_z), (q_x, q_y, q_z))
             sheet = ti.static(RestSheet(u, forces, by_column, fields, constants, rows, width, q, work))
-            band = ti.static(RowBand(0, 1, low, high, 1, rows, 0, fire))
+            band = ti.static(RowBand(0, 1, low, high, 1, rows))
             if fire[PLACED] > 0:
                 for i in range(low, high):
                     settle_row(sheet, row, i)
@@ -318,8 +303,8 @@ def _build_relax(config: KernelConfig) -> Callable[..., None]:
 @cache
 def _build_scale(config: KernelConfig) -> Callable[..., None]:
     """Build the kernel of `Relaxation.scale`."""
-    real, vector, vectors, columns = config.real, config.vector, config.vectors, config.first_column(None)
-    constant_count, mobility = config.first_constant(None), build_point_functions(config).mobility
+    real, vector, vectors, columns = config.real, config.vector, config.vectors, config.columns().end
+    constant_count, mobility = config.constants().end, build_point_functions(config).mobility
     max_spring_force = config.require(SpringTerm).build_max_spring_force(config)
     forces = [
         force for term in config.terms if not isinstance(term, BendingTerm) for force in term.build_forces(config)
@@ -333,15 +318,7 @@ def _build_scale(config: KernelConfig) -> Callable[..., None]:
         d_x: vectors, d_y: vectors, d_z: vectors,
         constants_of: ti.types.ndarray(dtype=vector, ndim=1), by_column: vectors, fields: vectors,
     ):  # fmt: skip
-        """Compute the square of the largest force of a spring, a load or the foundation on a mass point.
-
-        Args:
-            rows: number of rows of the sheet.
-            width: number of entries of a row.
-            result: output, the square [N^2], shape (1,).
-            row: row of the load table, shape (1, columns).
-            u_x, u_y, u_z, d_x, d_y, d_z, constants_of, by_column, fields: `SheetArrays.all`.
-        """
+        """Compute the square of the largest force of a spring, a load or the foundation on a mass point [N^2]."""
         ti.loop_config(serialize=True)
         for _ in range(1):
             constants = [constants_of[n][0] for n in ti.static(range(constant_count))]

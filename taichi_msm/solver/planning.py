@@ -33,7 +33,7 @@ from taichi_msm.model.sheet import (
     tissue_problems,
 )
 from taichi_msm.model.time_grid import TimeGrid
-from taichi_msm.model.tools import Tool, build_tools, friction_problem, path_problems, speed_problem
+from taichi_msm.model.tools import SolidTool, build_tools, path_problems, solid_tools
 from taichi_msm.scene.scene import Scene, Time
 from taichi_msm.scene.section import FRAME_TOLERANCE
 from taichi_msm.scene.sheet import Sheet
@@ -80,9 +80,7 @@ class Work(NamedTuple):
 def count_work(plan: Plan, companions: float) -> Work:
     """Return the estimated work of a run by stages [f32 steps of a mass point].
 
-    Args:
-        plan: plan of the run.
-        companions: work of its companion runs [f64 steps of the sheet per step of the run].
+    `companions` is the work of its companion runs [f64 steps of the sheet per step of the run].
     """
     steps = _stepping_work(plan)
     stepping = F64_WORK * steps if plan.grid.precision == "f64" else steps
@@ -90,12 +88,7 @@ def count_work(plan: Plan, companions: float) -> Work:
 
 
 def affords_companions(plan: Plan, companions: float) -> bool:
-    """Return whether companion runs take at most MAX_COMPANION_FRACTION of the work of a run.
-
-    Args:
-        plan: plan of the run.
-        companions: work of the companion runs [f64 steps of the sheet per step of the run].
-    """
+    """Return whether companion runs, see `count_work`, take at most MAX_COMPANION_FRACTION of the work of a run."""
     work = count_work(plan, companions)
     return work.companions <= MAX_COMPANION_FRACTION * sum(work)
 
@@ -116,11 +109,7 @@ def _other_work(scene: Scene) -> float:
 
 
 def make_plan(scene: Scene) -> Plan:
-    """Return the plan of a scene for a CPU.
-
-    Raises:
-        SceneError: when sheet, steps or paths are invalid; it lists all problems.
-    """
+    """Return the plan of a scene for a CPU; a SceneError has all problems of sheet, steps and paths."""
     plan, problems = try_plan(scene)
     if plan is None or problems:
         raise SceneError([str(problem) for problem in problems])
@@ -128,14 +117,10 @@ def make_plan(scene: Scene) -> Plan:
 
 
 def try_plan(scene: Scene, maps: Maps | None = None) -> tuple[Plan | None, list[Problem]]:
-    """Build the plan of a scene for a CPU and check sheet, steps and paths.
+    """Build the plan of a scene for a CPU, None with an invalid material, and check sheet, steps and paths.
 
-    Args:
-        scene: scene with valid keys; checks across keys may still fail.
-        maps: images of its stiffness maps; by default read from their files.
-
-    Returns:
-        The plan, or None with an invalid material, and all problems.
+    The keys of the scene are valid; checks across keys may fail. By default its stiffness maps are read from their
+    files.
     """
     problems = list(material_key_problems(scene))
     if problems:
@@ -152,12 +137,7 @@ def try_plan(scene: Scene, maps: Maps | None = None) -> tuple[Plan | None, list[
 
 
 def plan_variant(plan: Plan, scene: Scene) -> Plan:
-    """Return the plan of a modified scene, without checks.
-
-    Args:
-        plan: plan of the original scene, whose maps are reused.
-        scene: the modified scene, known to be valid.
-    """
+    """Return the plan of a modified scene that is known to be valid, with the maps of the original, without checks."""
     return _plan(scene, plan.maps, fixed_points(scene.sheet), derive_material(scene, plan.maps))
 
 
@@ -180,14 +160,10 @@ def _plan(scene: Scene, maps: Maps, fixed: NDArray[np.bool_], material: Material
 
 
 def choose_precision(plan: Plan, arch: str) -> Plan:
-    """Return a plan with the precision chosen for an arch.
+    """Return a plan with the precision chosen for an arch, cpu, cuda or vulkan.
 
     Quasi-static scenes always use f64. With `auto`, a CPU uses f64 if the scene has a tolerance or if stepping is a
     small part of the work; GPUs use f32, because f64 is slow or missing there.
-
-    Args:
-        plan: plan in any precision.
-        arch: cpu, cuda or vulkan.
     """
     time = plan.scene.time
     if time.at_rest:
@@ -200,13 +176,7 @@ def choose_precision(plan: Plan, arch: str) -> Plan:
 
 
 def stable_step(material: Material, sheet: Sheet, difference: str) -> float:
-    """Return the largest stable step of a sheet [s], see `Integrator.largest_step`.
-
-    Args:
-        material: coefficients of the sheet.
-        sheet: section `sheet` of the scene.
-        difference: difference quotient of the damping, central or backward.
-    """
+    """Return the largest stable step of a sheet [s] for a difference quotient of the damping, central or backward."""
     return INTEGRATORS[difference].largest_step(highest_frequency(material, sheet), material.drag)
 
 
@@ -216,14 +186,10 @@ def min_stable_steps(plan: Plan) -> int:
 
 
 def steps_per_frame(time: Time, limit: float) -> int:
-    """Return the number of steps per frame; 1 in quasi-static scenes.
+    """Return the number of steps per frame, for the largest stable step [s]; 1 in quasi-static scenes.
 
-    With `auto`, it is the smallest number whose step is at most half the limit; `accuracy.time_step` increases it for
-    a tolerance. A given step is rounded to a frame divided by a whole number.
-
-    Args:
-        time: section `time` of the scene.
-        limit: largest stable step [s].
+    With `auto`, it is the smallest number whose step is at most half the limit; `accuracy.time_step` increases it for a
+    tolerance. A given step is rounded to a frame divided by a whole number.
     """
     if time.at_rest:
         return 1
@@ -234,12 +200,7 @@ def steps_per_frame(time: Time, limit: float) -> int:
 
 
 def with_time(scene: Scene, **changes: Any) -> Scene:
-    """Return a copy of a scene with other values in its section `time`.
-
-    Args:
-        scene: the scene, not modified.
-        **changes: new values by key, not validated.
-    """
+    """Return a copy of a scene with other values in its section `time`, which are not validated."""
     return scene.model_copy(update={"time": scene.time.model_copy(update=changes)})
 
 
@@ -292,21 +253,12 @@ Keyframe = tuple[float, float, float, float]
 
 
 def steer_plan(plan: Plan, probes: Sequence[Probe | Mapping[str, Any] | None], now: float) -> Plan:
-    """Replace the probes of a plan from a time on.
+    """Replace the probes of a plan from a time [s] on; None or the current probe for no change.
 
-    Args:
-        plan: plan of the run.
-        probes: one item per probe of the plan; None or the current probe for no change. The `path` of a
-            position-controlled tool contains only keyframes after `now`; a mapping may omit its instrument, friction
-            and grips, which then stay the same.
-        now: the current time [s].
-
-    Returns:
-        Plan with the new probes, whose paths include the past keyframes on which later steps depend.
-
-    Raises:
-        ArgumentError: when the number of probes differs.
-        SceneError: when a probe is invalid, or when a position-controlled tool would jump or change its past.
+    The given `path` of a position-controlled tool contains only keyframes after `now`; a mapping may omit its
+    instrument, friction and grips, which then stay the same. The new paths include the past keyframes on which later
+    steps depend. An ArgumentError reports another number of probes, and a SceneError an invalid probe or a position-
+    controlled tool that would jump or change its past.
     """
     before = plan.scene.probes
     if len(probes) != len(before):
@@ -325,12 +277,7 @@ def steer_plan(plan: Plan, probes: Sequence[Probe | Mapping[str, Any] | None], n
 
 
 def with_current_paths(plan: Plan, probes: Sequence[Probe]) -> Plan:
-    """Return a plan with the position-controlled tools of other probes.
-
-    Args:
-        plan: plan of the run.
-        probes: one probe per probe of the plan; force-controlled ones are ignored.
-    """
+    """Return a plan with the position-controlled tools of other probes, one per probe of the plan."""
     if not plan.tools:
         return plan
     pairs = zip(plan.scene.probes, probes, strict=True)
@@ -376,15 +323,16 @@ def _path_problems(plan: Plan, index: int, before: Probe, given: Probe, now: flo
         yield Problem((*key, "clamp"), "cannot change; restart with the new scene")
         return
     joined, first = _join_paths(plan, before, given, now)
-    (old_tool,), (tool,) = build_tools((before,), sheet), build_tools((joined,), sheet)
-    if problem := friction_problem(tool, at_rest=at_rest):
-        yield Problem((*key, "friction"), problem)
-    if not at_rest and (fault := speed_problem(tool, plan.grid, first)):
-        yield Problem((*key, "path", fault[0] - first - 1), fault[1])
-    deviation = _shape_change(old_tool, tool)
-    if deviation > tool.stride_limit:
-        text = f"changes by {deviation:.3g} m in a step, over {tool.stride_limit:.3g} m; change it gradually"
-        yield Problem((*key, "instrument"), text)
+    old_tools, tools = (solid_tools(build_tools((probe,), sheet)) for probe in (before, joined))
+    for n, tool in tools.items():
+        if problem := tool.friction_problem(at_rest=at_rest):
+            yield Problem((*key, "friction"), problem)
+        if not at_rest and (fault := tool.speed_problem(plan.grid, first)):
+            yield Problem((*key, "path", fault[0] - first - 1), fault[1])
+        deviation = _shape_change(old_tools[n], tool)
+        if deviation > tool.stride_limit:
+            text = f"changes by {deviation:.3g} m in a step, over {tool.stride_limit:.3g} m; change it gradually"
+            yield Problem((*key, "instrument"), text)
     for n, (begin, end) in enumerate(given.grip):
         has_ended = end <= now + tolerance
         continues = any(begin == old_begin and old_end > now + tolerance for old_begin, old_end in before.grip)
@@ -403,7 +351,7 @@ def _past_keyframes(path: Sequence[Keyframe], now: float, tolerance: float) -> l
     return [*past, (now, across, down, height)]
 
 
-def _shape_change(before: Tool, after: Tool) -> float:
+def _shape_change(before: SolidTool, after: SolidTool) -> float:
     """Bound the displacement [m] of points of a tool whose shape changes while its lowest point is fixed."""
     ends = np.linalg.norm(after.length * after.axis - before.length * before.axis)
     return float(ends) + 2 * abs(after.radius - before.radius)

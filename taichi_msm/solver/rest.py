@@ -30,7 +30,7 @@ from taichi_msm.errors import DivergedError, Pause
 from taichi_msm.model.loads import evaluate_frame_loads
 from taichi_msm.model.plan import Plan
 from taichi_msm.model.sheet import rest_positions
-from taichi_msm.model.tools import Clamp
+from taichi_msm.model.tools import clamps, solid_tools
 from taichi_msm.scene.section import MIN_MAGNITUDE
 from taichi_msm.solver.arrays import InitialData, SheetLayout
 from taichi_msm.solver.dynamics import POINT_STEPS_PER_LAUNCH, Dynamics
@@ -58,9 +58,8 @@ Array = NDArray[np.float64]
 class QuasiStatics(SheetSolver[Relaxation]):
     """The sheet in quasi-static motion, solved by a single worker of a CPU.
 
-    Attributes:
-        evaluations: number of evaluations of the forces for the last frame.
-        residual: largest residual force of the last frame, relative to the largest force.
+    For the last frame it has the number of `evaluations` of the forces, and the largest `residual` force, relative to
+    the largest force.
     """
 
     @staticmethod
@@ -77,12 +76,8 @@ class QuasiStatics(SheetSolver[Relaxation]):
     def advance(self, steps: int, pause: Pause = lambda: None) -> None:
         """Find the equilibria of the next frames, and of the first frame if it is still missing.
 
-        Args:
-            steps: number of frames.
-            pause: called between launches; after an exception from it, another call continues from the last frame.
-
-        Raises:
-            DivergedError: when the iteration does not converge.
+        After an exception from `pause`, called between launches, another call continues from the last frame. A
+        DivergedError reports an iteration that does not converge.
         """
         end = self.steps_done + steps
         while self._last_frame is None or self.steps_done < end:
@@ -118,21 +113,18 @@ class QuasiStatics(SheetSolver[Relaxation]):
     def _touched(self) -> NDArray[np.bool_]:
         return contact_rest.touched_points(len(self.plan.tools), self._read_contact())
 
-    @property
-    def _contact_column(self) -> int:
-        return self.layout.config.first_column(ContactTerm)
-
     def _read_contact(self) -> Array:
-        return self._read_memory()[self.layout.config.memory_slice(ContactTerm)]
+        return self._read_memory()[self.layout.config.memory(ContactTerm).all]
 
     def _write_contact(self, memory: Array) -> None:
-        self.kernel.arrays.set_fields(self.layout.config.first_field(ContactTerm), memory)
+        self.kernel.arrays.set_fields(self.layout.config.fields(ContactTerm).first, memory)
 
     def _settle(self, frame: int, pause: Pause) -> None:
         """Find the equilibrium of a frame from that of the previous frame, through intermediate shapes."""
         self.evaluations = 0
         before, loads = self.state(), evaluate_frame_loads(self.plan, frame)
-        tools, contact_before = self.plan.tools, before.memory[self.layout.config.memory_slice(ContactTerm)]
+        config, tools = self.layout.config, self.plan.tools
+        contact_before = before.memory[config.memory(ContactTerm).all]
         contact = contact_rest.memory_after_grips(self.plan, frame, before.displacement, contact_before)
         gripped_before, grips = (contact_rest.is_gripping(tools, memory) for memory in (contact_before, contact))
         if tools:
@@ -143,7 +135,7 @@ class QuasiStatics(SheetSolver[Relaxation]):
         times = self._shape_times(frame)
         for start, time in pairwise(times):
             row = self._load_table(loads, frame)
-            contact_rest.set_tools(self.plan, frame, time, row[0, self._contact_column :])
+            contact_rest.set_tools(self.plan, frame, time, row[0], config.columns(ContactTerm))
             # After the end of a grip the flat shape is tried even if a tool touches the sheet.
             free = not (loads.strength.any() or grips or self._is_clamp_displaced(time))
             free = free and (gripped_before or not self._meets_tool(time))
@@ -161,7 +153,7 @@ class QuasiStatics(SheetSolver[Relaxation]):
     def _update_memory(self, row: NDArray[Any]) -> None:
         """Evaluate the forces once more, if they change what terms remember."""
         config = self.layout.config
-        changing = [term for term in config.terms if term.mark_update(row[0, config.first_column(type(term)) :])]
+        changing = [term for term in config.terms if term.mark_update(row[0, config.columns(type(term)).all])]
         if changing:
             self.kernel.relax(1, math.inf, row)
 
@@ -171,7 +163,7 @@ class QuasiStatics(SheetSolver[Relaxation]):
         after = contact_rest.stick(plan, memory, start, start, times)
         if contact_rest.stuck_points(plan, memory).any() and (after != memory).any():
             # Until they stick, mass points move like a sheet without further contact, with an error of second order.
-            smooth = contact_rest.without_rough_tools(plan, row, self._contact_column)
+            smooth = contact_rest.without_rough_tools(plan, row, self.layout.config.columns(ContactTerm))
             self._relax(frame, smooth, PERTURBATION_TOLERANCE, pause)
             after = contact_rest.stick(plan, memory, start, self._read_arrays(differences=False)[0], times)
         self._write_contact(after)
@@ -194,11 +186,11 @@ class QuasiStatics(SheetSolver[Relaxation]):
 
     def _meets_tool(self, time: float) -> bool:
         position = rest_positions(self.plan.scene.sheet) + self._read_arrays(differences=False)[0]
-        return any(tool.touches(position[~self.plan.fixed], time) for tool in self.plan.tools)
+        free = position[~self.plan.fixed]
+        return any(tool.touches(free, time) for tool in solid_tools(self.plan.tools).values())
 
     def _is_clamp_displaced(self, time: float) -> bool:
-        clamps = [tool for tool in self.plan.tools if isinstance(tool, Clamp)]
-        return any(clamp.tip_centre(np.array([time])).any() for clamp in clamps)
+        return any(clamp.path_at(np.array([time])).any() for clamp in clamps(self.plan.tools).values())
 
     def _try_flat(self, row: NDArray[Any]) -> bool:
         """Set the flat shape if it is an equilibrium, and return whether it is."""
@@ -262,8 +254,7 @@ class QuasiStatics(SheetSolver[Relaxation]):
         stiffest = 1.0 if material.factors is None else float(material.factors.max())
         # Rounding may shorten a spring by 1e-9.
         compressed = self.read().shortest_spring < 1 - material.tension / stiffest - 1e-9
-        touching = [n for n, tool in enumerate(self.plan.tools) if not isinstance(tool, Clamp)]
-        return compressed or bool(self._touched()[touching].any())
+        return compressed or bool(self._touched()[list(solid_tools(self.plan.tools))].any())
 
     def _perturb(self, force: float) -> None:
         """Displace every mass point at random, reproducibly, at most by the displacement due to a force [N]."""
@@ -294,15 +285,8 @@ class QuasiStatics(SheetSolver[Relaxation]):
 def build_solver(
     plan: Plan, device: Device, layout: SheetLayout | None = None, cores: int | None = None
 ) -> SheetSolver[Any]:
-    """Build the solver of a plan, dynamic or quasi-static.
+    """Build the solver of a plan, dynamic or quasi-static, with the sheet at rest.
 
-    Args:
-        plan: plan of the run.
-        device: device of the arrays.
-        layout: replaces the layout chosen by `choose_layout`, for tests.
-        cores: largest number of CPU cores; by default all available cores.
-
-    Returns:
-        Solver with the sheet at rest; a quasi-static one finds the first frame in its first call of `advance`.
+    A quasi-static one finds the first frame in its first call of `advance`.
     """
     return (QuasiStatics if plan.scene.time.at_rest else Dynamics)(plan, device, layout, cores)

@@ -14,22 +14,16 @@ Contact with position-controlled tools is resolved afterwards, in the rows that 
 from collections.abc import Callable
 
 from taichi_msm.system.runtime import ti
-from taichi_msm.terms.base import DX, DY, HAS_LEFT, HAS_RIGHT, Correction, Entry, KernelConfig, RowPair, build_max_lane
+from taichi_msm.terms.base import BY_COLUMN, DX, DY, Correction, Entry, KernelConfig, RowPair, build_max_lane
 from taichi_msm.terms.springs import SpringTerm
 
 
 def build_pass_row(config: KernelConfig, move: Callable[..., None]) -> Callable[..., None]:
     """Build the Taichi function that computes the forces on a row and steps it.
 
-    Args:
-        config: compile-time configuration.
-        move: Taichi function move(sheet, entry, target, force, now) that steps an entry with the force of its springs,
-            see `build_point_step`.
-
-    Returns:
-        The Taichi function pass_row(sheet, carried, carried_row, line, source, next_row, exists, up, loads, n, moving).
+    move(sheet, entry, target, force, now) steps an entry with the force of its springs, see `build_point_step`.
     """
-    vector, columns, springs = config.vector, config.first_column(None), config.require(SpringTerm)
+    vector, columns, springs = config.vector, config.columns().end, config.require(SpringTerm)
     structural, shear, open_edges = springs.structural, springs.shear, springs.open_edges
     force_on_right, force_on_other = springs.build_spring_forces(config)
 
@@ -38,20 +32,11 @@ def build_pass_row(config: KernelConfig, move: Callable[..., None]) -> Callable[
         sheet: ti.template(), carried: ti.template(), carried_row, line: ti.template(), source, next_row, exists, up,
         loads: ti.template(), n, moving,
     ):  # fmt: skip
-        """Compute the forces on a row, and step it if `moving`.
+        """Compute the forces on a row `line`, and step it if `moving`.
 
-        Args:
-            sheet: a `KernelSheet`.
-            carried: forces carried to the next row [N], as three arrays.
-            carried_row: row of `carried`.
-            line: the row, a `KernelRow`.
-            source: row of u with its displacements.
-            next_row: row of u with the displacements of the next row of the pass.
-            exists: 1, or 0 if the sheet has no next row.
-            up: y of the next row minus y of this row, at rest [m].
-            loads: load table, shape (steps, columns).
-            n: row of the load table.
-            moving: whether to step the row.
+        Its displacements are in row `source` of u, those of the next row of the pass in row `next_row`. `exists` is 1,
+        or 0 if the sheet has no next row, and `up` its y minus that of this row, at rest [m]. Row `carried_row` of the
+        three arrays `carried` has the forces carried to the next row [N]; row n of `loads` is that of the step.
         """
         width, strip, i = sheet.width, sheet.width - 2, line.i
         diagonal = ti.sqrt(sheet.constants[DX] * sheet.constants[DX] + sheet.constants[DY] * sheet.constants[DY])
@@ -65,7 +50,7 @@ def build_pass_row(config: KernelConfig, move: Callable[..., None]) -> Callable[
         this, following = [vector(0) for _ in ti.static(range(3))], [vector(0) for _ in ti.static(range(3))]
         has_left, has_right = vector(1), vector(1)
         if ti.static(open_edges):
-            has_right = sheet.by_column[HAS_RIGHT * width + 0]
+            has_right = sheet.by_column[BY_COLUMN.has_right * width + 0]
         u = [sheet.u[c][row] for c in ti.static(range(3))]
         if ti.static(structural):
             first = force_on_right(sheet, pair, row + 1, 0, u, has_right)
@@ -86,7 +71,10 @@ def build_pass_row(config: KernelConfig, move: Callable[..., None]) -> Callable[
                 last[c] = this[c]
                 this[c] = following[c]
             if ti.static(open_edges):
-                has_left, has_right = sheet.by_column[HAS_LEFT * width + b], sheet.by_column[HAS_RIGHT * width + b]
+                has_left, has_right = (
+                    sheet.by_column[BY_COLUMN.has_left * width + b],
+                    sheet.by_column[BY_COLUMN.has_right * width + b],
+                )
             if ti.static(shear):
                 to_left = force_on_other(sheet, pair, next_at + b - 1, -1, b, u, has_left * exists)
                 for c in ti.static(range(3)):
@@ -117,7 +105,7 @@ def build_pass_row(config: KernelConfig, move: Callable[..., None]) -> Callable[
                 move(sheet, entry, source, force, now)
         if ti.static(shear):
             if ti.static(open_edges):
-                has_left = sheet.by_column[HAS_LEFT * width + strip + 1]
+                has_left = sheet.by_column[BY_COLUMN.has_left * width + strip + 1]
             for c in ti.static(range(3)):
                 u[c] = sheet.u[c][row + strip + 1]
             end = force_on_other(sheet, pair, next_at + strip, -1, strip + 1, u, has_left * exists)
@@ -130,16 +118,8 @@ def build_pass_row(config: KernelConfig, move: Callable[..., None]) -> Callable[
 
 
 def build_correct_row(config: KernelConfig, correction: Correction) -> Callable[..., None]:
-    """Build the Taichi function that applies the correction of a term to a row, if the row may need it.
-
-    Args:
-        config: compile-time configuration.
-        correction: Taichi functions of the term.
-
-    Returns:
-        The Taichi function correct_row(sheet, i, kind, loads, n), for row i and row n of the load table.
-    """
-    columns, (reaches, resolve), max_lane = config.first_column(None), correction, build_max_lane(config)
+    """Build the Taichi function correct_row(sheet, i, kind, loads, n), which corrects row i, if a term may need it."""
+    columns, (reaches, resolve), max_lane = config.columns().end, correction, build_max_lane(config)
 
     @ti.func
     def correct_row(sheet: ti.template(), i, kind, loads: ti.template(), n):

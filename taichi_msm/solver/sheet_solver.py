@@ -23,7 +23,7 @@ from taichi_msm.system.process import available_threads
 from taichi_msm.system.runtime import Device, lanes
 from taichi_msm.terms import base, build_terms
 from taichi_msm.terms.loads import ProbeTerm, decay_parameters
-from taichi_msm.terms.springs import MAX_STRAIN, MIN_STRAIN, SpringTerm
+from taichi_msm.terms.springs import SpringTerm
 
 Kernel = TypeVar("Kernel", bound=SheetKernel)
 
@@ -35,15 +35,9 @@ CACHED_BAND_BYTES = 384 << 10
 
 
 def choose_layout(plan: Plan, device: Device, cores: int | None = None) -> SheetLayout:
-    """Return the memory layout of a sheet, its division among workers, and the configuration of its kernels.
+    """Choose the memory layout of a sheet, its division among up to `cores` workers, and its kernels' configuration.
 
-    Args:
-        plan: plan of the run.
-        device: device of the arrays.
-        cores: largest number of CPU cores; by default all available cores.
-
-    Raises:
-        DeviceError: when the device does not support the scene.
+    By default all available cores are used. A DeviceError reports a device that does not support the scene.
     """
     (rows, cols), fixed, precision = plan.scene.sheet.points, plan.fixed, plan.grid.precision
     fixed_rows = bool(fixed[0].all()), bool(fixed[-1].all())
@@ -82,18 +76,8 @@ def choose_layout(plan: Plan, device: Device, cores: int | None = None) -> Sheet
 class SheetSolver(ABC, Generic[Kernel]):
     """A sheet that advances by steps; in quasi-static motion a frame counts as a step.
 
-    Args:
-        plan: plan of the run.
-        device: device of the arrays; for quasi-static motion a CPU.
-        layout: replaces the layout chosen by `choose_layout`, for tests.
-        cores: largest number of CPU cores; by default all available cores.
-
-    Attributes:
-        plan: current plan.
-        layout: memory layout, and configuration of the kernels.
-        steps_done: number of steps taken.
-        inconsistent: whether an interruption left the arrays inconsistent; all methods but `restart` then raise
-            MsmError.
+    A given `layout` replaces that of `choose_layout`, for tests. After `steps_done` steps an interruption can leave the
+    arrays `inconsistent`; all methods but `restart` then raise MsmError.
     """
 
     def __init__(self, plan: Plan, device: Device, layout: SheetLayout | None = None, cores: int | None = None) -> None:
@@ -111,11 +95,7 @@ class SheetSolver(ABC, Generic[Kernel]):
 
     @property
     def kernel(self) -> Kernel:
-        """The arrays of the sheet, with the kernels that move and read it.
-
-        Raises:
-            MsmError: when a restart was interrupted.
-        """
+        """The arrays of the sheet, with the kernels that move and read it; an MsmError after an interrupted restart."""
         if self._kernel is None:
             raise MsmError("interrupted while the sheet was restarted; restart the scene")
         return self._kernel
@@ -123,9 +103,7 @@ class SheetSolver(ABC, Generic[Kernel]):
     def restart(self, plan: Plan, state: State | None = None) -> None:
         """Restart with the same or another plan, without compilation if only coefficients differ.
 
-        Args:
-            plan: the plan.
-            state: state to continue from, of a sheet with the same mass points and steps; by default the sheet at rest.
+        By default the sheet is at rest; a state to continue from has the same mass points and steps.
         """
         self.inconsistent = True
         self._begin(state)
@@ -136,11 +114,7 @@ class SheetSolver(ABC, Generic[Kernel]):
         self.inconsistent = False
 
     def steer(self, plan: Plan) -> None:
-        """Continue with a plan that differs in its probes only, with the same kernels and steps.
-
-        Raises:
-            ArgumentError: when the new probes require other kernels.
-        """
+        """Continue with a plan that differs in its probes only; an ArgumentError if they require other kernels."""
         config, terms = self.layout.config, build_terms(plan)
         if [tool.probe for tool in plan.tools] != [tool.probe for tool in self.plan.tools]:
             raise ArgumentError("probes: which of them have a path cannot change; restart with the new scene")
@@ -150,16 +124,14 @@ class SheetSolver(ABC, Generic[Kernel]):
                 raise ArgumentError(f"probes: {reason}")
         if decay_parameters(plan) != decay_parameters(self.plan):
             probes = config.require(ProbeTerm)
-            self.kernel.arrays.set_fields(config.first_field(ProbeTerm), probes.fields(plan))
+            self.kernel.arrays.set_fields(config.fields(ProbeTerm).first, probes.fields(plan))
         self.plan = plan
 
     @abstractmethod
     def advance(self, steps: int, pause: Pause = lambda: None) -> None:
-        """Advance by a number of steps.
+        """Advance by a number of steps; an exception from `pause`, called between launches, interrupts.
 
-        Args:
-            steps: number of steps.
-            pause: called between launches; an exception from it interrupts, and another call of `advance` continues.
+        Another call continues.
         """
 
     @abstractmethod
@@ -187,17 +159,11 @@ class SheetSolver(ABC, Generic[Kernel]):
         self._kernel = None
 
     def _load_table(self, loads: Schedule, first: int) -> NDArray[Any]:
-        """Return the load table of consecutive steps, with a gain of 0, shape (steps, columns).
-
-        Args:
-            loads: loads at the steps.
-            first: number of the first step.
-        """
+        """Return the load table of consecutive steps from `first` on, with a gain of 0, shape (steps, columns)."""
         config = self.layout.config
-        table = np.zeros((len(loads.active), config.first_column(None)))
+        table = np.zeros((len(loads.active), config.columns().end))
         for term in config.terms:
-            column = config.first_column(type(term))
-            table[:, column : column + term.column_count] = term.columns(self.plan, loads, first)
+            table[:, config.columns(type(term)).all] = term.columns(self.plan, loads, first)
         # Loads too large for f32 become infinite; the next reading of the sheet detects it.
         with np.errstate(over="ignore"):
             return table.astype(self._dtype)
@@ -206,20 +172,19 @@ class SheetSolver(ABC, Generic[Kernel]):
         """Read and measure the sheet; with `moving`, the energy includes the kinetic energy."""
         displacement, measures = self._read_arrays(differences=False)
         config, plan = self.layout.config, self.plan
-        springs = measures[:, config.first_measure(SpringTerm) :]
+        springs = config.measures(SpringTerm)
         # The measures are (L^2 - L0^2) / L0^2.
-        extremes = springs[:, MIN_STRAIN].min(), springs[:, MAX_STRAIN].max()
+        extremes = measures[:, springs.min_strain].min(), measures[:, springs.max_strain].max()
         shortest, longest = (math.sqrt(max(0.0, 1.0 + float(extreme))) for extreme in extremes)
         sums = measures.sum(axis=0, dtype=np.float64)
         energy = plan.material.mass * float(sums[base.SQUARED_MOTION]) / plan.grid.step**2 if moving else 0.0
         for term in config.terms:
-            first = config.first_measure(type(term))
-            energy += term.energy(sums[first : first + len(term.reductions)], plan)
+            energy += term.energy(sums[config.measures(type(term)).all], plan)
         return Reading(self.steps_done, displacement, shortest, longest, energy / 2)
 
     def _read_arrays(self, *, differences: bool) -> tuple[NDArray[Any], NDArray[Any]]:
         """Read displacements or last differences, and measures of every row, see `SheetKernel.read`."""
-        rows, cols, count = self.layout.rows, self.layout.cols, self.layout.config.first_measure(None)
+        rows, cols, count = self.layout.rows, self.layout.cols, self.layout.config.measures().end
         values, measures = np.empty((rows, cols, 3), self._dtype), np.empty((rows, count), self._dtype)
         self.kernel.read(differences, values, measures)
         return values, measures
@@ -237,14 +202,14 @@ class SheetSolver(ABC, Generic[Kernel]):
 def _initial_data(plan: Plan, layout: SheetLayout, state: State | None) -> InitialData:
     sheet, config = plan.scene.sheet, layout.config
     column, areas, mobility = np.arange(layout.cols), area_shares(sheet), plan.mobility
-    by_column = np.empty((base.COLUMN_ROWS, layout.cols))
+    by_column, places = np.empty((base.BY_COLUMN.count, layout.cols)), base.BY_COLUMN
     # One row of each kind: first, middle, last.
-    by_column[base.MOBILITY : base.MOBILITY + 3] = mobility[[0, layout.rows // 2, -1]]
+    by_column[places.mobility] = mobility[[0, layout.rows // 2, -1]]
     # Springs along columns read the shares of a middle row even in a sheet of two rows.
-    by_column[base.AREA_SHARE : base.AREA_SHARE + 3] = areas[0], 2 * areas[0], areas[-1]
-    by_column[base.REST_X] = axes(sheet)[0]
-    by_column[base.HAS_LEFT] = column > 0
-    by_column[base.HAS_RIGHT] = column < layout.cols - 1
+    by_column[places.area_share] = areas[0], 2 * areas[0], areas[-1]
+    by_column[places.rest_x] = axes(sheet)[0]
+    by_column[places.has_left] = column > 0
+    by_column[places.has_right] = column < layout.cols - 1
     of_terms = (constant for term in config.terms for constant in term.constants(plan))
     constants = *spacing(sheet), sheet.size[0] / 2, *of_terms
     fields = [term.fields(plan) for term in config.terms]

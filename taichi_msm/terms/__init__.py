@@ -37,14 +37,9 @@ TERMS: tuple[type[Term], ...] = (
 
 
 def derive_material(scene: Scene, maps: Maps) -> Material:
-    """Derive the coefficients of a sheet.
+    """Derive the coefficients of a sheet; without `maps`, images by key, its stiffness maps are ignored.
 
-    Args:
-        scene: a scene without `material_key_problems`.
-        maps: images of the scene's stiffness maps by key; missing ones are ignored.
-
-    Returns:
-        Coefficients of the sheet.
+    The scene has no `material_key_problems`.
     """
     (dx, dy), mass = spacing(scene.sheet), scene.sheet.mass
     samplers = {"map": cell_factors, "foundation_map": point_factors}
@@ -85,12 +80,7 @@ def fictitious_masses(material: Material, sheet: Sheet) -> NDArray[np.float64]:
 
 
 def highest_frequency(material: Material, sheet: Sheet) -> float:
-    """Return an upper bound of the angular frequencies [rad/s], valid while springs exceed half their rest length.
-
-    Args:
-        material: coefficients of the sheet.
-        sheet: section `sheet` of the scene.
-    """
+    """Return an upper bound of the angular frequencies [rad/s], valid while springs exceed half their rest length."""
     if material.shares is None and material.springs is None:
         return math.sqrt(sum(term.stiffness_bound(material, sheet) for term in TERMS) / material.mass)
     shares = point_areas(material, sheet) if material.by_area else 1.0

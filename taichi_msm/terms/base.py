@@ -17,22 +17,26 @@ from taichi_msm.model.plan import Plan
 from taichi_msm.model.sheet import Material
 from taichi_msm.scene.scene import Scene
 from taichi_msm.scene.sheet import Sheet
+from taichi_msm.terms.places import Places
 
-# Rows of the array `by_column`. MOBILITY and AREA_SHARE take three: for the first, inner and last rows of the sheet.
-# With `KernelConfig.by_point` both are the first fields instead.
-MOBILITY, AREA_SHARE, REST_X, HAS_LEFT, HAS_RIGHT, COLUMN_ROWS = 0, 3, 6, 7, 8, 9
+# Rows of the array `by_column`. The first two have three rows, for the first, inner and last rows of the sheet. With
+# `KernelConfig.by_point` they are fields instead.
+BY_COLUMN = Places(
+    mobility=3,  # inverse share of a cell's mass, 0 if fixed
+    area_share=3,  # share of a cell's area
+    rest_x=1,  # x at rest [m]
+    has_left=1,  # 1 with a neighbour on this side, else 0
+    has_right=1,
+)
 
-# Indices of the constants of a sheet: dx, dy and y of the first row [m], followed by the constants of its terms.
+# First constants, followed by those of the terms: dx, dy and y of the first row [m].
 DX, DY, TOP_Y, GEOMETRY_COUNT = range(4)
 
-# First fields, where mobility and area vary from point to point; where the sheet is curved, x, y and z at rest follow.
-POINT_FIELDS, REST_FIELDS = 2, 3
+# First column of the load table, followed by those of the terms: displacement per force [m/N].
+GAIN, STEP_COLUMNS = range(2)
 
-# First column of the load table: the gain of the step, displacement per force [m/N]. Columns of the terms follow.
-GAIN, STEP_COLUMNS = 0, 1
-
-# First measure of a row: the sum of m |d|^2, with the mass m of a point relative to a cell's. Measures of terms follow.
-SQUARED_MOTION, STEP_MEASURES = 0, 1
+# First measure of a row, followed by those of the terms: sum of m |d|^2, with m relative to the mass of a cell.
+SQUARED_MOTION, STEP_MEASURES = range(2)
 
 
 class Term(ABC):
@@ -42,7 +46,6 @@ class Term(ABC):
     """
 
     reach: ClassVar[int] = 0  # rows on either side that affect the force on a row
-    constant_count: ClassVar[int] = 0  # number of the term's constants
     reductions: ClassVar[tuple[str, ...]] = ()  # reduction of each measure over a row: "min", "max" or "sum"
     has_gradient: ClassVar[bool] = False  # whether `build_tangents` linearises its whole force
     key: ClassVar[str] = ""  # key of the scene, for messages of a term without a gradient
@@ -73,30 +76,40 @@ class Term(ABC):
         return cls.stiffness_bound(material, sheet)
 
     def constants(self, plan: Plan) -> tuple[float, ...]:
-        """Return the term's constants, `constant_count` numbers."""
+        """Return the term's constants, in the order of `constant_places`."""
         return ()
 
     @property
-    def column_count(self) -> int:
-        """Number of the term's columns of the load table."""
-        return 0
+    def constant_places(self) -> Places:
+        """Names of the term's constants."""
+        return Places()
+
+    @property
+    def column_places(self) -> Places:
+        """Names of the term's columns of the load table."""
+        return Places()
+
+    @property
+    def field_places(self) -> Places:
+        """Names of the term's fields, arrays with a number per mass point; those in `memory` come last."""
+        return Places()
+
+    @property
+    def measure_places(self) -> Places:
+        """Names of the term's measures of a row."""
+        return Places()
 
     @property
     def memory(self) -> tuple[str, ...]:
-        """Names of the term's state variables at every mass point. They are its last fields."""
+        """Names of the term's state variables at every mass point, in checkpoints."""
         return ()
 
     def has_history(self, plan: Plan) -> bool:
         """Return whether the term makes equilibria depend on earlier loads."""
         return bool(self.memory)
 
-    @property
-    def field_count(self) -> int:
-        """Number of the term's fields, arrays with a number per mass point."""
-        return len(self.memory)
-
     def columns(self, plan: Plan, loads: Schedule, first: int) -> NDArray[Any]:
-        """Return the term's columns of the load table, shape (steps, column_count).
+        """Return the term's columns of the load table, shape (steps, columns).
 
         Args:
             plan: plan of the run.
@@ -106,14 +119,14 @@ class Term(ABC):
         return np.empty((len(loads.active), 0))
 
     def fields(self, plan: Plan) -> NDArray[Any]:
-        """Return the initial values of the term's fields, shape (field_count, rows, cols)."""
-        return np.zeros((self.field_count, *plan.scene.sheet.points))
+        """Return the initial values of the term's fields, shape (fields, rows, cols)."""
+        return np.zeros((self.field_places.count, *plan.scene.sheet.points))
 
     def energy(self, sums: NDArray[Any], plan: Plan) -> float:
         """Return twice the term's energy [J].
 
         Args:
-            sums: the term's measures, reduced over the sheet, shape (reductions,).
+            sums: the term's measures, reduced over the sheet, shape (measures,).
             plan: plan of the run.
         """
         return 0.0
@@ -153,7 +166,7 @@ class Term(ABC):
         """Request the update of the memory in the next evaluation of the forces, after a frame reached equilibrium.
 
         Args:
-            columns: row of the load table, from the first column of the term on, in and out.
+            columns: the term's columns of a row of the load table, in and out.
 
         Returns:
             Whether the term has such an update.
@@ -248,39 +261,45 @@ class KernelConfig:
         assert term is not None, kind
         return term
 
-    def first_constant(self, kind: type[Term] | None) -> int:
-        """Return the index of a term's first constant; with None, the number of constants."""
-        return GEOMETRY_COUNT + sum(term.constant_count for term in self._before(kind))
+    def constants(self, kind: type[Term] | None = None) -> Places:
+        """Return the constants of a term; by default of no term, after all others."""
+        return self._places(kind, GEOMETRY_COUNT, lambda term: term.constant_places)
 
-    def first_column(self, kind: type[Term] | None) -> int:
-        """Return the index of a term's first column of the load table; with None, the number of columns."""
-        return STEP_COLUMNS + sum(term.column_count for term in self._before(kind))
+    def columns(self, kind: type[Term] | None = None) -> Places:
+        """Return the columns of a term in the load table; by default of no term, after all others."""
+        return self._places(kind, STEP_COLUMNS, lambda term: term.column_places)
 
-    def first_field(self, kind: type[Term] | None) -> int:
-        """Return the index of a term's first field; with None, the number of fields."""
-        own = POINT_FIELDS * self.by_point + REST_FIELDS * self.curved
-        return own + sum(term.field_count for term in self._before(kind))
+    def fields(self, kind: type[Term] | None = None) -> Places:
+        """Return the fields of a term; by default of no term, after all others."""
+        return self._places(kind, self.point_fields.count, lambda term: term.field_places)
+
+    def measures(self, kind: type[Term] | None = None) -> Places:
+        """Return the measures of a term; by default of no term, after all others."""
+        return self._places(kind, STEP_MEASURES, lambda term: term.measure_places)
+
+    def memory(self, kind: type[Term]) -> Places:
+        """Return the part of `State.memory` that belongs to a term."""
+        return self._places(kind, 0, lambda term: Places(names=len(term.memory)))
+
+    @property
+    def point_fields(self) -> Places:
+        """The first fields, followed by those of the terms; x, y and z at rest [m] of a curved sheet."""
+        return Places(mobility=int(self.by_point), area_share=int(self.by_point), rest=3 * self.curved)
 
     @property
     def memory_fields(self) -> list[int]:
         """Indices of the fields that steps change, in the order of `State.memory`."""
-        ends = [self.first_field(type(term)) + term.field_count for term in self.terms]
+        ends = [self.fields(type(term)).end for term in self.terms]
         return [n for term, end in zip(self.terms, ends, strict=True) for n in range(end - len(term.memory), end)]
 
-    def memory_slice(self, kind: type[Term]) -> slice:
-        """Return the slice of `State.memory` with the memory of a term."""
-        begin = sum(len(term.memory) for term in self._before(kind))
-        term = self.get(kind)
-        return slice(begin, begin + (len(term.memory) if term else 0))
-
-    def first_measure(self, kind: type[Term] | None) -> int:
-        """Return the index of a term's first measure; with None, the number of measures."""
-        return STEP_MEASURES + sum(len(term.reductions) for term in self._before(kind))
-
-    def _before(self, kind: type[Term] | None) -> tuple[Term, ...]:
-        """Return the terms before a term; all if the scene does not have it."""
-        kinds = [type(term) for term in self.terms]
-        return self.terms if kind not in kinds else self.terms[: kinds.index(kind)]
+    def _places(self, kind: type[Term] | None, first: int, places_of: Callable[[Term], Places]) -> Places:
+        """Return the places of a term, from `first` on after those of the terms before it; none without the term."""
+        for term in self.terms:
+            places = places_of(term).at(first)
+            if type(term) is kind:
+                return places
+            first = places.end
+        return Places(first)
 
 
 def build_max_lane(config: KernelConfig) -> Callable[..., Any]:

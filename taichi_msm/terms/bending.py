@@ -17,7 +17,8 @@ from taichi_msm.model.plan import Plan
 from taichi_msm.model.sheet import Material, spacing
 from taichi_msm.scene.scene import Scene
 from taichi_msm.scene.sheet import Sheet
-from taichi_msm.terms.base import DX, DY, HAS_LEFT, HAS_RIGHT, KernelConfig, Term
+from taichi_msm.terms.base import BY_COLUMN, DX, DY, KernelConfig, Term
+from taichi_msm.terms.places import Places
 
 
 @dataclass(frozen=True)
@@ -27,8 +28,6 @@ class BendingTerm(Term):
     has_gradient: ClassVar[bool] = True
     # The force on a row depends on the moments of both neighbouring rows, and these on displacements one row further.
     reach: ClassVar[int] = 2
-    constant_count: ClassVar[int] = 1
-    # The sum of the squared Laplacian.
     reductions: ClassVar[tuple[str, ...]] = ("sum",)
 
     @staticmethod
@@ -50,6 +49,14 @@ class BendingTerm(Term):
         dx, dy = spacing(sheet)
         return material.bending * (4 / dx**2 + 4 / dy**2) ** 2
 
+    @property
+    def constant_places(self) -> Places:
+        return Places(stiffness=1)
+
+    @property
+    def measure_places(self) -> Places:
+        return Places(squared_laplacian=1)
+
     def constants(self, plan: Plan) -> tuple[float, ...]:
         return (plan.material.bending,)
 
@@ -59,17 +66,18 @@ class BendingTerm(Term):
     def build_store_moment(self, config: KernelConfig) -> Callable[..., None]:
         """Build the Taichi function store_moment(sheet, i, before, row, after, b, target)."""
         ti = config.ti
-        vector, constant, laplacian = config.vector, config.first_constant(BendingTerm), build_laplacian(config)
+        vector, constants, laplacian = config.vector, config.constants(BendingTerm), build_laplacian(config)
 
         @ti.func
         def store_moment(sheet: ti.template(), i, before, row, after, b, target):
             """Store the moment of entry b of row i, which is row `row` of u, in row `target` of u."""
-            dx, dy, stiffness = sheet.constants[DX], sheet.constants[DY], sheet.constants[constant]
+            dx, dy, stiffness = sheet.constants[DX], sheet.constants[DY], sheet.constants[constants.stiffness]
             across, down = stiffness / (dx * dx), stiffness / (dy * dy)
             for c in ti.static(range(3)):
                 sheet.u[c][target * sheet.width + b] = vector(0)
             if 0 < i < sheet.rows - 1:
-                inside = sheet.by_column[HAS_LEFT * sheet.width + b] * sheet.by_column[HAS_RIGHT * sheet.width + b]
+                left, right = BY_COLUMN.has_left * sheet.width + b, BY_COLUMN.has_right * sheet.width + b
+                inside = sheet.by_column[left] * sheet.by_column[right]
                 for c in ti.static(range(3)):
                     curved = laplacian(sheet.u[c], sheet.width, before, row, after, b, across, down)
                     sheet.u[c][target * sheet.width + b] = inside * curved
@@ -96,12 +104,13 @@ class BendingTerm(Term):
 
     def build_measures(self, config: KernelConfig) -> Sequence[Callable[..., None]]:
         ti = config.ti
-        real, vector, first = config.real, config.vector, config.first_measure(BendingTerm)
+        real, vector, places = config.real, config.vector, config.measures(BendingTerm)
         laplacian = build_laplacian(config)
 
         @ti.func
         def measure(measures: ti.template(), sheet: ti.template(), p, _i, kind, b):
-            inside = sheet.by_column[HAS_LEFT * sheet.width + b] * sheet.by_column[HAS_RIGHT * sheet.width + b]
+            left, right = BY_COLUMN.has_left * sheet.width + b, BY_COLUMN.has_right * sheet.width + b
+            inside = sheet.by_column[left] * sheet.by_column[right]
             inside *= ti.cast(kind == 1, real)
             # The first and the last row have no neighbour on one side.
             before, after = p - ti.cast(kind == 1, ti.i32), p + ti.cast(kind == 1, ti.i32)
@@ -111,7 +120,7 @@ class BendingTerm(Term):
             for c in ti.static(range(3)):
                 curvature = inside * laplacian(sheet.u[c], sheet.width, before, p, after, b, across, down)
                 squared_curvature += curvature * curvature
-            measures[first] += squared_curvature
+            measures[places.squared_laplacian] += squared_curvature
 
         return (measure,)
 

@@ -11,8 +11,8 @@ friction mu reduces their slip; u' and c' are those before the step:
 A correction has the effect of the force correction / gain (`integrators`), so the corrections yield the force of the
 tool.
 
-A grip holds the mass points within 1.5 radii of the tip's centre at its start: u = u_start + c - c_start. A clamp, a
-tool of radius 0 whose c is a displacement, holds its side from the start of the run: u = c.
+A grip holds the mass points within 1.5 radii of the tip at its start: u = u_start + c - c_start. A clamp, whose
+c is a displacement, touches nothing and holds its side from the start of the run: u = c.
 
 In quasi-static scenes a tool pushes the mass points that touch it, and never pulls. Of the force F on a mass point it
 carries the part into its shape, min(F . n, 0) n; the remainder, tangential or outward, vanishes in equilibrium. If
@@ -34,44 +34,71 @@ from typing_extensions import Self
 
 from taichi_msm.model.loads import Schedule
 from taichi_msm.model.plan import Plan
-from taichi_msm.model.tools import GRIP_RADII, Clamp
+from taichi_msm.model.tools import GRIP_RADII, clamps, solid_tools
 from taichi_msm.scene.section import FRAME_TOLERANCE
 from taichi_msm.shapes import SHAPES
 from taichi_msm.shapes.shape import MIN_DISTANCE_M
 from taichi_msm.terms.base import DY, TOP_Y, Correction, KernelConfig, RestCorrection, Term, build_max_lane
+from taichi_msm.terms.places import Places
 from taichi_msm.terms.points import build_point_functions
 
-# Columns of the load table. For all tools: the weight of the step's corrections. For each tool: the tip's centre after
-# and before the step; the state of its grip, and the tool's displacement since the grip began; axis, length, radius and
-# friction; the reciprocals of y and z of the axis.
-WEIGHT, COLUMNS = 0, 1
-TIP_AFTER, TIP_BEFORE, GRIP_STATE, GRIP_SHIFT, AXIS = 0, 3, 6, 7, 10
-LENGTH, RADIUS, FRICTION, INVERSE_AXIS, TOOL_COLUMNS = 13, 14, 15, 16, 18
+# Columns of a tool in the load table; a clamp has neither axis nor radius.
+TOOL = Places(
+    tip_after=3,  # c after the step [m]
+    tip_before=3,  # c before the step [m]
+    grip_state=1,
+    grip_shift=3,  # displacement of the tool since its grip began [m]
+    axis=3,  # unit vector from the tip along the shaft
+    axis_length=1,  # [m]
+    radius=1,  # [m]
+    friction=1,
+    inverse_axis=2,  # reciprocals of y and z of the axis
+)
 
 # States of a grip in a step; 0 without one.
 GRIP_BEGINS, GRIP_CONTINUES = 1.0, 2.0
 
-# Fields: for each tool, the sum of the corrections (3); with grips, the holder of a mass point and a displacement (3):
-#     free                     0
-#     held by tool n           n + 1             displacement when the grip began
-#     stuck to rough tool n    tools + n + 1     displacement relative to the tip (`contact_rest`)
-CORRECTIONS, HOLDER, HOLD_DISPLACEMENT = 3, 0, 1
+# Holder of a mass point that no tool holds.
+FREE = 0
+
+
+def held_by(tool: int) -> int:
+    """Return the holder of the mass points in the grip of a tool."""
+    return 1 + tool
+
+
+def stuck_to(tool: int, tools: int) -> int:
+    """Return the holder of the mass points that stick to a rough tool, one of `tools` tools."""
+    return 1 + tools + tool
+
+
+def contact_fields(tools: int) -> Places:
+    """Return the fields of contact; a scene without grips has only the corrections.
+
+    The hold of a gripped mass point is its displacement when the grip began [m]; that of a stuck one is its
+    displacement relative to the tip.
+    """
+    return Places(corrections=[3] * tools, holder=1, hold=3)
 
 
 @dataclass(frozen=True)
 class ContactTerm(Term):
     """Position-controlled tools."""
 
-    shapes: tuple[str, ...]  # for each tool, the name of its shape
+    shapes: tuple[str, ...]  # for each tool, the name of its shape; empty for a clamp
     has_friction: tuple[bool, ...]  # for each tool, whether it has friction
     grips: bool  # whether any tool holds mass points, by a grip, as a clamp or as a rough tool
 
     @classmethod
     def from_plan(cls, plan: Plan) -> Self | None:
-        tools = plan.tools
-        grips = any(tool.grips or tool.rough or isinstance(tool, Clamp) for tool in tools)
-        shapes = tuple(tool.shape.name for tool in tools)
-        return cls(shapes, tuple(tool.friction > 0 for tool in tools), grips) if tools else None
+        tools, solids, numbers = plan.tools, solid_tools(plan.tools), range(len(plan.tools))
+        if not tools:
+            return None
+        return cls(
+            shapes=tuple(solids[n].shape.name if n in solids else "" for n in numbers),
+            has_friction=tuple(n in solids and solids[n].friction > 0 for n in numbers),
+            grips=bool(clamps(tools)) or any(tool.grips or tool.rough for tool in tools),
+        )
 
     @property
     def memory(self) -> tuple[str, ...]:
@@ -82,42 +109,51 @@ class ContactTerm(Term):
         """Return whether any tool is rough."""
         return any(tool.rough for tool in plan.tools)
 
+    @property
+    def field_places(self) -> Places:
+        places = contact_fields(len(self.shapes))
+        return places if self.grips else Places(corrections=[3] * len(self.shapes))
+
     def fields(self, plan: Plan) -> NDArray[Any]:
         fields = super().fields(plan)
-        for n, tool in enumerate(plan.tools):
-            if isinstance(tool, Clamp):
-                fields[CORRECTIONS * len(plan.tools) + HOLDER, tool.points] = n + 1
+        for n, clamp in clamps(plan.tools).items():
+            fields[self.field_places.holder, clamp.points] = held_by(n)
         return fields
 
     @property
-    def column_count(self) -> int:
-        return COLUMNS + TOOL_COLUMNS * len(self.shapes)
+    def column_places(self) -> Places:
+        # For all tools the weight of the step's corrections, then the columns of each.
+        return Places(weight=1, tools=[TOOL] * len(self.shapes))
 
     def columns(self, plan: Plan, loads: Schedule, first: int) -> NDArray[Any]:
         grid, steps = plan.grid, first + np.arange(len(loads.active) + 1)
         t, frame = steps / grid.steps_per_second, 1 / grid.frames_per_second
         _, gain, first_gain = plan.step_coefficients
-        columns = np.zeros((len(loads.active), self.column_count))
+        places = self.column_places
+        columns = np.zeros((len(loads.active), places.count))
         # The first step has another gain, so the force of its corrections differs.
-        columns[:, WEIGHT] = np.where(steps[:-1] == 0, gain / first_gain, 1.0)
-        for n, tool in enumerate(plan.tools):
-            tool_columns = columns[:, COLUMNS + TOOL_COLUMNS * n : COLUMNS + TOOL_COLUMNS * (n + 1)]
-            centres = tool.tip_centre(t)
-            tool_columns[:, TIP_AFTER:TIP_BEFORE], tool_columns[:, TIP_BEFORE:GRIP_STATE] = centres[1:], centres[:-1]
-            inverse = [1 / slope if abs(slope) > MIN_DISTANCE_M else 1 / MIN_DISTANCE_M for slope in tool.axis[1:]]
-            tool_columns[:, AXIS:] = *tool.axis, tool.length, tool.radius, tool.friction, *inverse
-            if isinstance(tool, Clamp):
-                tool_columns[:, GRIP_STATE] = GRIP_CONTINUES
-                tool_columns[:, GRIP_SHIFT:AXIS] = centres[1:]
+        columns[:, places.weight] = np.where(steps[:-1] == 0, gain / first_gain, 1.0)
+        for tool, at in zip(plan.tools, places.tools, strict=True):
+            centres = tool.path_at(t)
+            columns[:, at.tip_after], columns[:, at.tip_before] = centres[1:], centres[:-1]
             for begin, end in tool.grips:
                 # The first steps at or after these times, up to rounding.
                 start, stop = (
                     max(0, math.ceil((time - FRAME_TOLERANCE * frame) * grid.steps_per_second)) for time in (begin, end)
                 )
                 active = (steps[:-1] >= start) & (steps[:-1] < stop)
-                tool_columns[active, GRIP_STATE] = np.where(steps[:-1] == start, GRIP_BEGINS, GRIP_CONTINUES)[active]
-                centre_at_start = tool.tip_centre(np.array([start / grid.steps_per_second]))
-                tool_columns[active, GRIP_SHIFT:AXIS] = (centres[1:] - centre_at_start)[active]
+                columns[active, at.grip_state] = np.where(steps[:-1] == start, GRIP_BEGINS, GRIP_CONTINUES)[active]
+                centre_at_start = tool.path_at(np.array([start / grid.steps_per_second]))
+                columns[np.ix_(active, at.grip_shift)] = (centres[1:] - centre_at_start)[active]
+        for n in clamps(plan.tools):
+            at = places.tools[n]
+            columns[:, at.grip_state], columns[:, at.grip_shift] = GRIP_CONTINUES, columns[:, at.tip_after]
+        for n, solid in solid_tools(plan.tools).items():
+            at = places.tools[n]
+            columns[:, at.axis], columns[:, at.axis_length] = solid.axis, solid.length
+            columns[:, at.radius], columns[:, at.friction] = solid.radius, solid.friction
+            inverse = [1 / slope if abs(slope) > MIN_DISTANCE_M else 1 / MIN_DISTANCE_M for slope in solid.axis[1:]]
+            columns[:, at.inverse_axis] = inverse
         return columns
 
     def supports(self, compiled: Self) -> str:
@@ -137,17 +173,15 @@ class ContactTerm(Term):
     def build_rest_correction(self, config: KernelConfig) -> RestCorrection:
         return RestCorrection(self._build_remove(config), self._build_project(config))
 
-    def _places(self, config: KernelConfig) -> tuple[int, int, list[int]]:
-        """Return the indices of the first field, of the first field of grips, and of the first column of each tool."""
-        field, column = config.first_field(ContactTerm), config.first_column(ContactTerm) + COLUMNS
-        tools = len(self.shapes)
-        return field, field + CORRECTIONS * tools, [column + TOOL_COLUMNS * tool for tool in range(tools)]
+    @property
+    def _solids(self) -> list[int]:
+        """Indices of the tools with a shape."""
+        return [n for n, shape in enumerate(self.shapes) if shape]
 
     def _build_reaches(self, config: KernelConfig) -> Callable[..., Any]:
-        ti, real, vector, tools, grips = config.ti, config.real, config.vector, len(self.shapes), self.grips
-        max_lane = build_max_lane(config)
-        _, grip_field, bases = self._places(config)
-        holder_field = grip_field + HOLDER
+        ti, real, vector, grips = config.ti, config.real, config.vector, self.grips
+        max_lane, columns, fields = build_max_lane(config), config.columns(ContactTerm), config.fields(ContactTerm)
+        solids = [columns.tools[n] for n in self._solids]
 
         @ti.func
         def cut(low, high, begin, end, start, inverse):
@@ -158,35 +192,34 @@ class ContactTerm(Term):
         @ti.func
         def reaches(sheet: ti.template(), i, low: ti.template(), high: ti.template(), now: ti.template()):
             y, reached = sheet.constants[TOP_Y] - i * sheet.constants[DY], False
-            for tool in ti.static(range(tools)):
-                base = ti.static(bases[tool])
+            for tool in ti.static(solids):
                 # Slightly more than the radius, because of rounding.
-                reach = 1.001 * now[base + RADIUS]
+                reach = 1.001 * now[tool.radius]
                 begin, end = cut(
-                    y + low[0] - reach, y + high[0] + reach, ti.cast(0, real), now[base + LENGTH],
-                    now[base + TIP_AFTER + 1], now[base + INVERSE_AXIS],
+                    y + low[0] - reach, y + high[0] + reach, ti.cast(0, real), now[tool.axis_length],
+                    now[tool.tip_after[1]], now[tool.inverse_axis[0]],
                 )  # fmt: skip
                 begin, end = cut(
-                    low[1] - reach, high[1] + reach, begin, end, now[base + TIP_AFTER + 2], now[base + INVERSE_AXIS + 1]
+                    low[1] - reach, high[1] + reach, begin, end, now[tool.tip_after[2]], now[tool.inverse_axis[1]]
                 )
                 reached = reached or begin <= end
                 if ti.static(grips):
-                    reached = reached or now[base + GRIP_STATE] == GRIP_BEGINS
+                    reached = reached or now[tool.grip_state] == GRIP_BEGINS
             if ti.static(grips):
                 held = vector(0)
                 for b in range(1, sheet.width - 1):
-                    held = ti.max(held, sheet.fields[(holder_field * sheet.rows + i) * sheet.width + b])
+                    held = ti.max(held, sheet.fields[(fields.holder * sheet.rows + i) * sheet.width + b])
                 reached = reached or max_lane(held) > 0
             return reached
 
         return reaches
 
     def _build_resolve(self, config: KernelConfig) -> Callable[..., None]:
-        ti, vector, tools, has_friction = config.ti, config.vector, len(self.shapes), self.has_friction
-        (first_field, grip_field, base), grips = self._places(config), self.grips
-        weight, max_lane = config.first_column(ContactTerm) + WEIGHT, build_max_lane(config)
+        ti, vector, has_friction, grips = config.ti, config.vector, self.has_friction, self.grips
+        columns, fields, max_lane = config.columns(ContactTerm), config.fields(ContactTerm), build_max_lane(config)
         mobility, _, rest_position = build_point_functions(config)
-        penetrations = [_build_penetration(config, shape) for shape in self.shapes]
+        penetrations = {n: self._build_penetration(config, n) for n in self._solids}
+        tools, holders = columns.tools, [held_by(n) for n in range(len(self.shapes))]
 
         @ti.func
         def resolve(sheet: ti.template(), i, kind, at, b, now: ti.template()):
@@ -196,39 +229,41 @@ class ContactTerm(Term):
             free = ti.select(mobility(sheet, i, kind, b) > 0, vector(1), vector(0))
             held = vector(0)
             if ti.static(grips):
-                held = sheet.fields[(grip_field + HOLDER) * rows * sheet.width + point]
+                held = sheet.fields[fields.holder * rows * sheet.width + point]
                 # All grips that end release their mass points before any other grip begins.
-                for tool in ti.static(range(tools)):
-                    if now[base[tool] + GRIP_STATE] != GRIP_CONTINUES:
-                        held = ti.select(held == tool + 1, vector(0), held)
-                for tool in ti.static(range(tools)):
-                    if now[base[tool] + GRIP_STATE] == GRIP_BEGINS:
+                for n, tool in ti.static(enumerate(tools)):
+                    if now[tool.grip_state] != GRIP_CONTINUES:
+                        held = ti.select(held == holders[n], vector(FREE), held)
+                for n, tool in ti.static(enumerate(tools)):
+                    if now[tool.grip_state] == GRIP_BEGINS:
                         squared = vector(0)
                         for c in ti.static(range(3)):
-                            offset = rest[c] + (u[c] - d[c]) - now[base[tool] + TIP_BEFORE + c]
+                            offset = rest[c] + (u[c] - d[c]) - now[tool.tip_before[c]]
                             squared += offset * offset
-                        radius = GRIP_RADII * now[base[tool] + RADIUS]
+                        radius = GRIP_RADII * now[tool.radius]
                         gripped = ti.select(squared <= radius * radius, free, vector(0)) * ti.select(
-                            held == 0, vector(1), vector(0)
+                            held == FREE, vector(1), vector(0)
                         )
-                        held += gripped * (tool + 1)
+                        held += gripped * holders[n]
                         for c in ti.static(range(3)):
-                            stored = (grip_field + HOLD_DISPLACEMENT + c) * rows * sheet.width + point
+                            stored = fields.hold[c] * rows * sheet.width + point
                             sheet.fields[stored] = ti.select(gripped > 0, u[c] - d[c], sheet.fields[stored])
-                sheet.fields[(grip_field + HOLDER) * rows * sheet.width + point] = held
-                free = ti.select(held == 0, free, vector(0))
-            for tool in ti.static(range(tools)):
-                inside, normal_x, normal_y, normal_z = penetrations[tool](rest, u, now, base[tool])
-                depth = ti.max(inside, 0) * free
+                sheet.fields[fields.holder * rows * sheet.width + point] = held
+                free = ti.select(held == FREE, free, vector(0))
+            for n, tool in ti.static(enumerate(tools)):
+                depth, normal = vector(0), [vector(0) for _ in ti.static(range(3))]
+                if ti.static(n in penetrations):
+                    inside, normal_x, normal_y, normal_z = penetrations[n](rest, u, now)
+                    depth = ti.max(inside, 0) * free
+                    normal[0], normal[1], normal[2] = normal_x, normal_y, normal_z
                 corrected = depth
                 if ti.static(grips):
-                    corrected = ti.select(held == tool + 1, vector(1), depth)
+                    corrected = ti.select(held == holders[n], vector(1), depth)
                 if max_lane(corrected) > 0:
-                    normal = [normal_x, normal_y, normal_z]
                     correction = [depth * normal[c] for c in ti.static(range(3))]
-                    if ti.static(has_friction[tool]):
+                    if ti.static(has_friction[n]):
                         slip = [
-                            d[c] + correction[c] - (now[base[tool] + TIP_AFTER + c] - now[base[tool] + TIP_BEFORE + c])
+                            d[c] + correction[c] - (now[tool.tip_after[c]] - now[tool.tip_before[c]])
                             for c in ti.static(range(3))
                         ]
                         normal_slip = vector(0)
@@ -238,61 +273,58 @@ class ContactTerm(Term):
                         for c in ti.static(range(3)):
                             slip[c] = slip[c] - normal_slip * normal[c]
                             squared_slip += slip[c] * slip[c]
-                        stopped = now[base[tool] + FRICTION] * depth / ti.max(ti.sqrt(squared_slip), MIN_DISTANCE_M)
+                        stopped = now[tool.friction] * depth / ti.max(ti.sqrt(squared_slip), MIN_DISTANCE_M)
                         stopped = ti.min(stopped, 1)
                         for c in ti.static(range(3)):
                             correction[c] = correction[c] - slip[c] * stopped
                     if ti.static(grips):
                         for c in ti.static(range(3)):
-                            target = sheet.fields[(grip_field + HOLD_DISPLACEMENT + c) * rows * sheet.width + point]
-                            target += now[base[tool] + GRIP_SHIFT + c]
-                            correction[c] = ti.select(held == tool + 1, target - u[c], correction[c])
+                            target = sheet.fields[fields.hold[c] * rows * sheet.width + point]
+                            target += now[tool.grip_shift[c]]
+                            correction[c] = ti.select(held == holders[n], target - u[c], correction[c])
                     for c in ti.static(range(3)):
                         # Lanes without a correction keep their bits, including the sign of zero.
                         u[c] = ti.select(corrected > 0, u[c] + correction[c], u[c])
                         d[c] = ti.select(corrected > 0, d[c] + correction[c], d[c])
                         sheet.u[c][entry], sheet.d[c][point] = u[c], d[c]
-                        index = (first_field + CORRECTIONS * tool + c) * rows * sheet.width + point
+                        index = fields.corrections[n][c] * rows * sheet.width + point
                         # `+=` would be atomic, which does not compile for vectors.
-                        sheet.fields[index] = sheet.fields[index] + correction[c] * now[weight]
+                        sheet.fields[index] = sheet.fields[index] + correction[c] * now[columns.weight]
 
         return resolve
 
     def _build_remove(self, config: KernelConfig) -> Callable[..., None]:
-        ti, vector, tools, grips = config.ti, config.vector, len(self.shapes), self.grips
-        first_field, grip_field, _ = self._places(config)
-        holder_field, iterations = grip_field + HOLDER, self._iterations
+        ti, vector, count, grips = config.ti, config.vector, len(self.shapes), self.grips
+        fields, iterations = config.fields(ContactTerm), self._iterations
 
         @ti.func
         def remove(force: ti.template(), sheet: ti.template(), at):
             field = sheet.rows * sheet.width
-            carried = [vector(0) for _ in ti.static(range(tools))]
+            carried = [vector(0) for _ in ti.static(range(count))]
             for _ in range(iterations):
-                for tool in ti.static(range(tools)):
-                    normal = [
-                        sheet.fields[(first_field + CORRECTIONS * tool + c) * field + at] for c in ti.static(range(3))
-                    ]
+                for n in ti.static(range(count)):
+                    normal = [sheet.fields[fields.corrections[n][c] * field + at] for c in ti.static(range(3))]
                     along = force[0] * normal[0] + force[1] * normal[1] + force[2] * normal[2]
-                    total = ti.max(carried[tool] - along, 0)
-                    change = total - carried[tool]
-                    carried[tool] = total
+                    total = ti.max(carried[n] - along, 0)
+                    change = total - carried[n]
+                    carried[n] = total
                     for c in ti.static(range(3)):
                         force[c] += change * normal[c]
             if ti.static(grips):
                 for c in ti.static(range(3)):
-                    force[c] = ti.select(sheet.fields[holder_field * field + at] > 0, vector(0), force[c])
+                    force[c] = ti.select(sheet.fields[fields.holder * field + at] > 0, vector(0), force[c])
 
         return remove
 
     def _build_project(self, config: KernelConfig) -> Callable[..., None]:
         """Build the function that projects mass points and their momenta out of the tools, and moves held ones."""
-        ti, vector, tools, grips = config.ti, config.vector, len(self.shapes), self.grips
-        (first_field, grip_field, base), iterations = self._places(config), self._iterations
+        ti, vector, count, grips, solids = config.ti, config.vector, len(self.shapes), self.grips, self._solids
+        tools, fields, iterations = config.columns(ContactTerm).tools, config.fields(ContactTerm), self._iterations
         mobility, _, rest_position = build_point_functions(config)
-        penetrations = [_build_penetration(config, shape) for shape in self.shapes]
+        penetrations = {n: self._build_penetration(config, n) for n in solids}
         # Holders, and the columns with the shift of their mass points: of grips, and of rough tools.
-        holders = [(tool + 1, base[tool] + GRIP_SHIFT) for tool in range(tools)]
-        holders += [(tools + tool + 1, base[tool] + TIP_AFTER) for tool in range(tools) if self.has_friction[tool]]
+        holders = [(held_by(n), tools[n].grip_shift) for n in range(count)]
+        holders += [(stuck_to(n, count), tools[n].tip_after) for n in range(count) if self.has_friction[n]]
 
         @ti.func
         def project(sheet: ti.template(), i, kind, b, now: ti.template()):
@@ -301,26 +333,26 @@ class ContactTerm(Term):
             u, q = [sheet.u[c][at] for c in ti.static(range(3))], [sheet.q[c][at] for c in ti.static(range(3))]
             free = ti.select(mobility(sheet, i, kind, b) > 0, vector(1), vector(0))
             if ti.static(grips):
-                held = sheet.fields[(grip_field + HOLDER) * field + at]
+                held = sheet.fields[fields.holder * field + at]
                 for holder, shift in ti.static(holders):
                     for c in ti.static(range(3)):
-                        target = sheet.fields[(grip_field + HOLD_DISPLACEMENT + c) * field + at] + now[shift + c]
+                        target = sheet.fields[fields.hold[c] * field + at] + now[shift[c]]
                         u[c] = ti.select(held == holder, target, u[c])
                         q[c] = ti.select(held == holder, vector(0), q[c])
                 free = ti.select(held > 0, vector(0), free)
-            for tool in ti.static(range(tools)):
+            for n in ti.static(solids):
                 for c in ti.static(range(3)):
-                    sheet.fields[(first_field + CORRECTIONS * tool + c) * field + at] = vector(0)
+                    sheet.fields[fields.corrections[n][c] * field + at] = vector(0)
             for _ in range(iterations):
-                for tool in ti.static(range(tools)):
-                    depth, x, y, z = penetrations[tool](rest, u, now, base[tool])
+                for n in ti.static(solids):
+                    depth, x, y, z = penetrations[n](rest, u, now)
                     normal = [x, y, z]
                     touches = ti.select(depth > 0, free, vector(0))
                     inward = ti.min(q[0] * x + q[1] * y + q[2] * z, 0) * touches
                     for c in ti.static(range(3)):
                         u[c] += touches * depth * normal[c]
                         q[c] = q[c] - inward * normal[c]
-                        index = (first_field + CORRECTIONS * tool + c) * field + at
+                        index = fields.corrections[n][c] * field + at
                         sheet.fields[index] = ti.select(touches > 0, normal[c], sheet.fields[index])
             for c in ti.static(range(3)):
                 sheet.u[c][at] = u[c]
@@ -328,22 +360,19 @@ class ContactTerm(Term):
 
         return project
 
+    def _build_penetration(self, config: KernelConfig, n: int) -> Callable[..., Any]:
+        """Build the Taichi function penetration(rest, u, now), the depth in tool n and the outward normal."""
+        ti, tool = config.ti, config.columns(ContactTerm).tools[n]
+        depth = ti.func(SHAPES[self.shapes[n]].build_depth(config.operations))
+
+        @ti.func
+        def penetration(rest: ti.template(), u: ti.template(), now: ti.template()):
+            r = [rest[c] - now[tool.tip_after[c]] + u[c] for c in ti.static(range(3))]
+            axis = [now[tool.axis[c]] for c in ti.static(range(3))]
+            return depth(r[0], r[1], r[2], axis[0], axis[1], axis[2], now[tool.axis_length], now[tool.radius])
+
+        return penetration
+
     @property
     def _iterations(self) -> int:
         return 8 if len(self.shapes) > 1 else 1
-
-
-def _build_penetration(config: KernelConfig, shape: str) -> Callable[..., Any]:
-    """Build penetration(rest, u, now, base), the depth in a tool with first column `base`, and the outward normal."""
-    ti = config.ti
-    depth = ti.func(SHAPES[shape].build_depth(config.operations))
-
-    @ti.func
-    def penetration(rest: ti.template(), u: ti.template(), now: ti.template(), base: ti.template()):
-        r = [rest[c] - now[base + TIP_AFTER + c] + u[c] for c in ti.static(range(3))]
-        return depth(
-            r[0], r[1], r[2], now[base + AXIS], now[base + AXIS + 1], now[base + AXIS + 2], now[base + LENGTH],
-            now[base + RADIUS],
-        )  # fmt: skip
-
-    return penetration

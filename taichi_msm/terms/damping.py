@@ -14,6 +14,7 @@ from typing_extensions import Self
 from taichi_msm.model.plan import Plan
 from taichi_msm.scene.scene import Scene
 from taichi_msm.terms.base import KernelConfig, Term
+from taichi_msm.terms.places import Places
 
 
 @dataclass(frozen=True)
@@ -21,7 +22,6 @@ class DampingTerm(Term):
     """Damping. It stores no energy; an integrator includes its effect on the stable step."""
 
     has_gradient: ClassVar[bool] = True
-    constant_count: ClassVar[int] = 1
 
     @staticmethod
     def derive(scene: Scene) -> dict[str, Any]:
@@ -37,11 +37,15 @@ class DampingTerm(Term):
     def from_plan(cls, plan: Plan) -> Self | None:
         return cls() if plan.material.drag > 0 else None
 
+    @property
+    def constant_places(self) -> Places:
+        return Places(keep=1)
+
     def constants(self, plan: Plan) -> tuple[float, ...]:
         return (plan.step_coefficients.keep,)
 
     def build_damping(self, config: KernelConfig) -> Sequence[Callable[..., Any]]:
-        ti, keep = config.ti, config.first_constant(DampingTerm)
+        ti, keep = config.ti, config.constants(DampingTerm).keep
 
         @ti.func
         def reduce(d: ti.template(), sheet: ti.template()):

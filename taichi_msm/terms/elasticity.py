@@ -83,17 +83,11 @@ def spring_families(plan: Plan) -> Iterator[SpringFamily]:
 
 
 def energy_density(plan: Plan, displacement: Array) -> Array:
-    """Compute the energy density of the springs, without bending and foundation.
+    """Return the energy density of the springs [J/m2], shape (rows, cols), without bending and foundation.
 
     Each end of a spring has half of its energy. The sum of density times `area_shares` times the area of a cell is
-    therefore the energy of all springs, relative to the state at rest.
-
-    Args:
-        plan: plan of the run.
-        displacement: x - X [m], shape (rows, cols, 3).
-
-    Returns:
-        Energy density [J/m2], shape (rows, cols).
+    therefore the energy of all springs, relative to the state at rest. The displacement x - X [m] has the shape (rows,
+    cols, 3).
     """
     by_point, (dx, dy) = np.zeros(displacement.shape[:2]), spacing(plan.scene.sheet)
     for family in spring_families(plan):

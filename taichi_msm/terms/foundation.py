@@ -25,7 +25,8 @@ from taichi_msm.model.sheet import Material, spacing
 from taichi_msm.scene.scene import Scene
 from taichi_msm.scene.sheet import Sheet
 from taichi_msm.terms.base import KernelConfig, Term
-from taichi_msm.terms.law import build_law
+from taichi_msm.terms.law import build_law, law_places
+from taichi_msm.terms.places import Places
 from taichi_msm.terms.points import build_point_functions
 
 Array = NDArray[np.float64]
@@ -75,22 +76,22 @@ class FoundationTerm(Term):
         return _steepest(material) * factors * (1.0 if material.shares is None else material.shares)
 
     @property
-    def column_count(self) -> int:
-        return 1
+    def column_places(self) -> Places:
+        return Places(stiffness=1)
 
     def columns(self, plan: Plan, loads: Schedule, first: int) -> NDArray[Any]:
         return plan.material.virtual * loads.active[:, None]
 
     @property
-    def field_count(self) -> int:
-        return int(self.mapped)
+    def field_places(self) -> Places:
+        return Places(factor=int(self.mapped))
 
     def fields(self, plan: Plan) -> NDArray[Any]:
         return point_shares(plan)[None] if self.mapped else super().fields(plan)
 
     @property
-    def constant_count(self) -> int:  # type: ignore[override]
-        return 2 + self.law.shape_count if self.law else 0
+    def constant_places(self) -> Places:
+        return law_places(self.law)
 
     def constants(self, plan: Plan) -> tuple[float, ...]:
         law = plan.material.virtual_stiffening
@@ -103,12 +104,15 @@ class FoundationTerm(Term):
         return (self._build_add(config, tangent=True),)
 
     def _build_add(self, config: KernelConfig, *, tangent: bool) -> Callable[..., Any]:
-        ti, has_law, column = config.ti, self.law is not None, config.first_column(FoundationTerm)
+        ti, has_law, columns = config.ti, self.law is not None, config.columns(FoundationTerm)
         stiffness_at, (secant, slope, _) = self.build_stiffness(config), self._build_law(config)
 
         @ti.func
         def add(force: ti.template(), sheet: ti.template(), entry: ti.template(), now: ti.template()):
-            k, u = stiffness_at(sheet, entry, now[column]), ti.static(entry.displacement if tangent else entry.u)
+            k, u = (
+                stiffness_at(sheet, entry, now[columns.stiffness]),
+                ti.static(entry.displacement if tangent else entry.u),
+            )
             for c in ti.static(range(3)):
                 if ti.static(has_law and c == 2 and tangent):
                     force[c] = force[c] - k * (entry.u[c] * slope(sheet, u[2]))
@@ -143,13 +147,13 @@ class FoundationTerm(Term):
 
     def build_stiffness(self, config: KernelConfig) -> Callable[..., Any]:
         """Build the Taichi function stiffness_at(sheet, entry, k), where k is the stiffness of a whole cell."""
-        ti, mapped, by_area, field = config.ti, self.mapped, self.by_area, config.first_field(FoundationTerm)
+        ti, mapped, by_area, fields = config.ti, self.mapped, self.by_area, config.fields(FoundationTerm)
         area_share = build_point_functions(config).area_share
 
         @ti.func
         def stiffness_at(sheet: ti.template(), entry: ti.template(), k):
             if ti.static(mapped):
-                return k * sheet.fields[(field * sheet.rows + entry.row.i) * sheet.width + entry.b]
+                return k * sheet.fields[(fields.factor * sheet.rows + entry.row.i) * sheet.width + entry.b]
             elif ti.static(by_area):  # noqa: RET505  # Taichi would compile the rest as well.
                 return k * area_share(sheet, entry.row.i, entry.row.kind, entry.b)
             else:
@@ -161,15 +165,14 @@ class FoundationTerm(Term):
         """Build the Taichi functions secant(sheet, u_z), tangent(sheet, u_z) and by_shape(sheet, u_z) of a law."""
         if self.law is None:
             return (_no_law,) * 3
-        ti, first, functions = config.ti, config.first_constant(FoundationTerm), build_law(self.law, config.operations)
-        count = self.law.shape_count
+        ti, places, functions = config.ti, config.constants(FoundationTerm), build_law(self.law, config.operations)
 
         def of_depth(function: Callable[..., Any]) -> Callable[..., Any]:
             @ti.func
             def at(sheet: ti.template(), u):
-                shape = [sheet.constants[first + 2 + n] for n in ti.static(range(count))]
+                shape = [sheet.constants[n] for n in ti.static(places.shape)]
                 # ti.static takes expressions in a list only.
-                return ti.static([function(0 - u * sheet.constants[first], shape)])[0]
+                return ti.static([function(0 - u * sheet.constants[places.inverse_scale], shape)])[0]
 
             return at
 

@@ -26,6 +26,7 @@ from typing import Any, NamedTuple
 from taichi_msm.arithmetic import Operations
 from taichi_msm.dual import Dual, dual_operations
 from taichi_msm.laws.law import Law
+from taichi_msm.terms.places import Places
 
 
 class LawFunctions(NamedTuple):
@@ -59,6 +60,11 @@ class SpringFunctions(NamedTuple):
     pull: Callable[..., Any]
     derivatives: Callable[..., Any]
     energy: Callable[..., Any]
+
+
+def law_places(law: Law | None) -> Places:
+    """Return the names of `LawNumbers.constants`; none without a law."""
+    return Places(inverse_scale=1, scale=1, shape=[1] * law.shape_count) if law else Places()
 
 
 def build_law(law: Law, operations: Operations) -> LawFunctions:

@@ -21,10 +21,11 @@ from taichi_msm.model.plan import Plan, ProbeSlot
 from taichi_msm.model.sheet import axes, spacing
 from taichi_msm.model.tool_force import probe_force
 from taichi_msm.terms.base import KernelConfig, Term
+from taichi_msm.terms.places import Places
 from taichi_msm.terms.points import build_point_functions
 
-# Columns of a slot: force (3), control point (2), falloff, shift and offset.
-FORCE, POINT, FALLOFF, SHIFT, OFFSET, SLOT_COLUMNS = 0, 3, 5, 6, 7, 8
+# Columns of a slot, see `ProbeForce`; `point` is the control point, x and y at rest [m].
+SLOT = Places(force=3, point=2, falloff=1, shift=1, offset=1)
 
 
 @dataclass(frozen=True)
@@ -43,21 +44,20 @@ class ProbeTerm(Term):
         return cls(tuple(slot.moves for slot in plan.slots), by_area)
 
     @property
-    def column_count(self) -> int:
-        return SLOT_COLUMNS * len(self.moves)
+    def column_places(self) -> Places:
+        return Places(slots=[SLOT] * len(self.moves))
 
     def columns(self, plan: Plan, loads: Schedule, first: int) -> NDArray[Any]:
-        slots = np.empty((len(loads.active), len(self.moves), SLOT_COLUMNS))
-        slots[..., FORCE:POINT] = loads.strength
-        slots[..., POINT:FALLOFF] = loads.point
-        for n, slot in enumerate(plan.slots):
-            force = probe_force(plan.scene.probes[slot.probe], plan.scene.sheet)
-            slots[:, n, FALLOFF:] = force.falloff, force.shift, force.offset
-        return slots.reshape(len(slots), self.column_count)
+        columns = np.empty((len(loads.active), self.column_places.count))
+        for n, (slot, places) in enumerate(zip(plan.slots, self.column_places.slots, strict=True)):
+            law = probe_force(plan.scene.probes[slot.probe], plan.scene.sheet)
+            columns[:, places.force], columns[:, places.point] = loads.strength[:, n], loads.point[:, n]
+            columns[:, [places.falloff, places.shift, places.offset]] = law.falloff, law.shift, law.offset
+        return columns
 
     @property
-    def field_count(self) -> int:
-        return self.moves.count(False)
+    def field_places(self) -> Places:
+        return Places(decays=[1] * self.moves.count(False))
 
     def fields(self, plan: Plan) -> NDArray[Any]:
         scene = plan.scene
@@ -66,28 +66,26 @@ class ProbeTerm(Term):
 
     def build_forces(self, config: KernelConfig) -> Sequence[Callable[..., Any]]:
         ti = config.ti
-        moves, by_area, first = self.moves, self.by_area, config.first_column(ProbeTerm)
-        vector, lanes = config.vector, config.lanes
-        first_field, (_, area_share, rest_position) = config.first_field(ProbeTerm), build_point_functions(config)
-        stationary = [first_field + moves[:n].count(False) for n in range(len(moves))]
+        moves, by_area, slots = self.moves, self.by_area, config.columns(ProbeTerm).slots
+        vector, lanes, decays = config.vector, config.lanes, self._decay_fields(config)
+        _, area_share, rest_position = build_point_functions(config)
 
         @ti.func
         def add(force: ti.template(), sheet: ti.template(), entry: ti.template(), now: ti.template()):
-            for n in ti.static(range(len(moves))):
-                column = ti.static(first + SLOT_COLUMNS * n)
+            for n, slot in ti.static(enumerate(slots)):
                 factor = vector(0)
                 if ti.static(moves[n]):
                     rest = rest_position(sheet, entry.row.i, entry.b)
-                    off_x, off_y = rest[0] - now[column + POINT], rest[1] - now[column + POINT + 1]
-                    exponent = now[column + FALLOFF] * ti.sqrt(off_x * off_x + off_y * off_y) + now[column + SHIFT]
-                    exponent = ti.max(exponent, now[column + OFFSET])
+                    off_x, off_y = rest[0] - now[slot.point[0]], rest[1] - now[slot.point[1]]
+                    exponent = now[slot.falloff] * ti.sqrt(off_x * off_x + off_y * off_y) + now[slot.shift]
+                    exponent = ti.max(exponent, now[slot.offset])
                     factor = vector([ti.exp(-exponent[lane]) for lane in ti.static(range(lanes))])
                     if ti.static(by_area[n]):
                         factor *= area_share(sheet, entry.row.i, entry.row.kind, entry.b)
                 else:
-                    factor = sheet.fields[(stationary[n] * sheet.rows + entry.row.i) * sheet.width + entry.b]
+                    factor = sheet.fields[(decays[n] * sheet.rows + entry.row.i) * sheet.width + entry.b]
                 for c in ti.static(range(3)):
-                    force[c] += now[column + c] * factor
+                    force[c] += now[slot.force[c]] * factor
 
         return (add,)
 
@@ -101,59 +99,61 @@ class ProbeTerm(Term):
             return "a probe cannot change between total and force; restart with the new scene"
         return ""
 
+    def _decay_fields(self, config: KernelConfig) -> list[int | None]:
+        """Return the field with the decay factors of each slot, None for a moving control point."""
+        fields = iter(config.fields(ProbeTerm).decays)
+        return [None if moves else next(fields) for moves in self.moves]
+
     def decay_gradients(self, plan: Plan) -> NDArray[Any]:
-        """Differentiate the fields by x and y of the control point [1/m], shape (field_count, 2, rows, cols)."""
+        """Differentiate the fields by x and y of the control point [1/m], shape (fields, 2, rows, cols)."""
         scene = plan.scene
         gradients = [decay_gradient(scene.probes[slot.probe], plan) for slot in plan.slots if not slot.moves]
         return np.array(gradients).reshape(-1, 2, *scene.sheet.points)
 
     def build_load_adjoint(self, config: KernelConfig, first_gradient: int) -> Callable[..., None]:
-        """Build the adjoint of the loads.
+        """Build add_adjoint(sums, sheet, entry, now), which differentiates force . `entry.u` of each slot.
 
-        Args:
-            config: compile-time configuration.
-            first_gradient: index of the first field of `decay_gradients` among the fields in `sheet.derivatives`.
-
-        Returns:
-            The Taichi function add_adjoint(sums, sheet, entry, now). It differentiates force . `entry.u` of each slot
-            with respect to the force (3) and the control point (2), and adds the derivatives to the list `sums`.
+        It adds the derivatives with respect to the force (3) and the control point (2) of each slot to the list `sums`.
+        `first_gradient` is the index of the first field of `decay_gradients` among the fields in `sheet.derivatives`.
         """
         ti = config.ti
-        moves, by_area, first = self.moves, self.by_area, config.first_column(ProbeTerm)
-        vector, lanes, first_field = config.vector, config.lanes, config.first_field(ProbeTerm)
+        moves, by_area, slots = self.moves, self.by_area, config.columns(ProbeTerm).slots
+        vector, lanes, decays = config.vector, config.lanes, self._decay_fields(config)
         _, area_share, rest_position = build_point_functions(config)
-        stationary = [moves[:n].count(False) for n in range(len(moves))]
+        # Derivatives of a slot; and of all stationary ones by x and y of the control point, among `sheet.derivatives`.
+        sums_of = Places(slots=[Places(force=3, point=2)] * len(moves)).slots
+        gradients = iter(Places(first_gradient, stationary=[2] * moves.count(False)).stationary)
+        gradient_fields = [None if moves[n] else next(gradients) for n in range(len(moves))]
 
         @ti.func
         def add_adjoint(sums: ti.template(), sheet: ti.template(), entry: ti.template(), now: ti.template()):
             i, b = entry.row.i, entry.b
-            for n in ti.static(range(len(moves))):
-                column = ti.static(first + SLOT_COLUMNS * n)
+            for n, slot in ti.static(enumerate(slots)):
                 factor, gradient = vector(0), [vector(0), vector(0)]
                 if ti.static(moves[n]):
                     rest = rest_position(sheet, i, b)
-                    off_x, off_y = rest[0] - now[column + POINT], rest[1] - now[column + POINT + 1]
+                    off_x, off_y = rest[0] - now[slot.point[0]], rest[1] - now[slot.point[1]]
                     distance = ti.sqrt(off_x * off_x + off_y * off_y)
-                    exponent = now[column + FALLOFF] * distance + now[column + SHIFT]
+                    exponent = now[slot.falloff] * distance + now[slot.shift]
                     # The derivative is 0 where the force does not depend on the distance, and at the control point.
-                    slope = now[column + FALLOFF] / ti.select(distance > 0, distance, vector(1))
-                    slope = ti.select(exponent > now[column + OFFSET], slope, vector(0))
-                    exponent = ti.max(exponent, now[column + OFFSET])
+                    slope = now[slot.falloff] / ti.select(distance > 0, distance, vector(1))
+                    slope = ti.select(exponent > now[slot.offset], slope, vector(0))
+                    exponent = ti.max(exponent, now[slot.offset])
                     factor = vector([ti.exp(-exponent[lane]) for lane in ti.static(range(lanes))])
                     if ti.static(by_area[n]):
                         factor *= area_share(sheet, i, entry.row.kind, b)
                     gradient[0], gradient[1] = factor * slope * off_x, factor * slope * off_y
                 else:
-                    factor = sheet.fields[((first_field + stationary[n]) * sheet.rows + i) * sheet.width + b]
+                    factor = sheet.fields[(decays[n] * sheet.rows + i) * sheet.width + b]
                     for axis in ti.static(range(2)):
-                        row = (first_gradient + 2 * stationary[n] + axis) * sheet.rows + i
+                        row = gradient_fields[n][axis] * sheet.rows + i
                         gradient[axis] = sheet.derivatives[row * sheet.width + b]
                 work = vector(0)
                 for c in ti.static(range(3)):
-                    sums[5 * n + c] += factor * entry.u[c]
-                    work += now[column + c] * entry.u[c]
+                    sums[sums_of[n].force[c]] += factor * entry.u[c]
+                    work += now[slot.force[c]] * entry.u[c]
                 for axis in ti.static(range(2)):
-                    sums[5 * n + 3 + axis] += work * gradient[axis]
+                    sums[sums_of[n].point[axis]] += work * gradient[axis]
 
         return add_adjoint
 
@@ -175,12 +175,7 @@ def max_free_acceleration(plan: Plan) -> float:
 
 
 def decay_norm_bound(slot: ProbeSlot, plan: Plan) -> float:
-    """Return an upper bound of the Euclidean norm of a slot's decay factors, over all mass points.
-
-    Args:
-        slot: slot of a probe; its control point may move.
-        plan: plan of the slot.
-    """
+    """Return an upper bound of the Euclidean norm of a slot's decay factors, over all mass points."""
     scene = plan.scene
     if not slot.moves:
         return float(np.linalg.norm(decay(scene.probes[slot.probe], plan)))

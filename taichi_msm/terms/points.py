@@ -8,7 +8,7 @@ On a uniform flat rectangle they are numbers per column, for the first, inner an
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
-from taichi_msm.terms.base import AREA_SHARE, DY, MOBILITY, POINT_FIELDS, REST_X, TOP_Y, KernelConfig
+from taichi_msm.terms.base import BY_COLUMN, DY, TOP_Y, KernelConfig
 
 
 class PointFunctions(NamedTuple):
@@ -21,29 +21,28 @@ class PointFunctions(NamedTuple):
 
 def build_point_functions(config: KernelConfig) -> PointFunctions:
     """Build the Taichi functions of the numbers of a mass point."""
-    ti, vector, by_point, curved = config.ti, config.vector, config.by_point, config.curved
-    rest = POINT_FIELDS * by_point
+    ti, vector, by_point, curved, fields = config.ti, config.vector, config.by_point, config.curved, config.point_fields
 
     @ti.func
     def mobility(sheet: ti.template(), i, kind, b):
         if ti.static(by_point):
-            return sheet.fields[i * sheet.width + b]
+            return sheet.fields[(fields.mobility * sheet.rows + i) * sheet.width + b]
         else:  # noqa: RET505  # Taichi would compile the rest as well.
-            return sheet.by_column[(MOBILITY + kind) * sheet.width + b]
+            return sheet.by_column[(BY_COLUMN.mobility.start + kind) * sheet.width + b]
 
     @ti.func
     def area_share(sheet: ti.template(), i, kind, b):
         if ti.static(by_point):
-            return sheet.fields[(sheet.rows + i) * sheet.width + b]
+            return sheet.fields[(fields.area_share * sheet.rows + i) * sheet.width + b]
         else:  # noqa: RET505
-            return sheet.by_column[(AREA_SHARE + kind) * sheet.width + b]
+            return sheet.by_column[(BY_COLUMN.area_share.start + kind) * sheet.width + b]
 
     @ti.func
     def rest_position(sheet: ti.template(), i, b):
         if ti.static(curved):
-            return [sheet.fields[((rest + c) * sheet.rows + i) * sheet.width + b] for c in ti.static(range(3))]
+            return [sheet.fields[(fields.rest[c] * sheet.rows + i) * sheet.width + b] for c in ti.static(range(3))]
         else:  # noqa: RET505
             y = vector(sheet.constants[TOP_Y] - i * sheet.constants[DY])
-            return [sheet.by_column[REST_X * sheet.width + b], y, vector(0)]
+            return [sheet.by_column[BY_COLUMN.rest_x * sheet.width + b], y, vector(0)]
 
     return PointFunctions(mobility, area_share, rest_position)

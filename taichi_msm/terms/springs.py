@@ -34,20 +34,25 @@ from taichi_msm.model.plan import Plan
 from taichi_msm.model.sheet import Material, Springs, largest_mean, spacing
 from taichi_msm.scene.scene import Scene
 from taichi_msm.scene.sheet import Sheet
-from taichi_msm.terms.base import AREA_SHARE, DX, DY, HAS_LEFT, HAS_RIGHT, KernelConfig, RowPair, Term
-from taichi_msm.terms.law import build_spring
+from taichi_msm.terms.base import BY_COLUMN, DX, DY, KernelConfig, RowPair, Term
+from taichi_msm.terms.law import build_spring, law_places
+from taichi_msm.terms.places import Places
 from taichi_msm.terms.points import build_point_functions
 
 # Families of springs with constants of their own, and with fields of their own: the diagonals of a cell differ there.
 ALONG_ROW, ALONG_COLUMN, DIAGONAL = range(3)
 FALLING, RISING, FAMILIES = 2, 3, 4
 
-# Measures: minimum and maximum of (L^2 - L0^2) / L0^2; sum of `SpringFunctions.energy` for each family; under tension,
-# sum of tau |q|^2 / L0^2 for each family. On a curved sheet the sums are multiplied by L0^2.
-MIN_STRAIN, MAX_STRAIN, STRETCH_SUMS, TENSION_SUMS = 0, 1, 2, 5
+# Measures. On a curved sheet the sums are multiplied by L0^2.
+MEASURES = Places(
+    min_strain=1,  # minimum of (L^2 - L0^2) / L0^2
+    max_strain=1,
+    stretch=3,  # sum of `SpringFunctions.energy` for each family
+    tension=3,  # under tension, sum of tau |q|^2 / L0^2 for each family
+)
 
-# Constants, each for all families in turn: k - tau, tau, numbers of the law.
-FIRST_TENSION, FIRST_NUMBER = 3, 6
+# Row of `by_column` with the share of springs along columns, that of cells in the inner rows of mass points.
+COLUMN_SHARE = BY_COLUMN.area_share[1]
 
 # Prevents a division by 0 at L = 0, where the force becomes 0; representable in f32, the type of literals in kernels.
 MIN_SQUARED_LENGTH = 1e-36
@@ -76,8 +81,19 @@ class SpringTerm(Term):
         return self.tense and self.open_edges
 
     @property
-    def constant_count(self) -> int:  # type: ignore[override]
-        return FIRST_NUMBER + 3 * self._number_count
+    def constant_places(self) -> Places:
+        return Places(
+            stiffness=3, tension=3, laws=[law_places(self.law)] * 3
+        )  # k - tau, tau and the law of each family
+
+    @property
+    def field_places(self) -> Places:
+        families = FAMILIES * self.varied
+        return Places(stiffness=families, tension=families * self.tense)
+
+    @property
+    def measure_places(self) -> Places:
+        return MEASURES
 
     @staticmethod
     def derive(scene: Scene) -> dict[str, Any]:
@@ -153,59 +169,50 @@ class SpringTerm(Term):
         numbers = (number for length in lengths if law for number in law.constants(length))
         return *stiffness, *material.tensions, *numbers
 
-    @property
-    def field_count(self) -> int:
-        return FAMILIES * (1 + self.tense) * self.varied
-
     def fields(self, plan: Plan) -> NDArray[Any]:
         """Return k - tau, and under tension tau, of all families [N/m], each spring at its upper left end."""
         if not self.varied:
             return super().fields(plan)
         points = plan.scene.sheet.points
-        springs, fields = assemble_springs(plan.material, points), np.zeros((self.field_count, *points))
+        springs, places = assemble_springs(plan.material, points), self.field_places
+        fields = np.zeros((places.count, *points))
         for family, (k, tau) in enumerate(zip(springs.stiffness, springs.tension, strict=True)):
             rows, cols = k.shape
-            fields[family, :rows, :cols] = np.maximum(k - tau, 0)
+            fields[places.stiffness[family], :rows, :cols] = np.maximum(k - tau, 0)
             if self.tense:
-                fields[FAMILIES + family, :rows, :cols] = tau
+                fields[places.tension[family], :rows, :cols] = tau
         return fields
 
     def energy(self, sums: NDArray[Any], plan: Plan) -> float:
-        total, springs = sums[STRETCH_SUMS:TENSION_SUMS] + sums[TENSION_SUMS:], plan.material.springs
+        total, springs = sums[MEASURES.stretch] + sums[MEASURES.tension], plan.material.springs
         if springs is not None and springs.rest is not None:
             return float(total.sum())
         dx, dy = spacing(plan.scene.sheet)
         return float(total @ (dx**2, dy**2, dx**2 + dy**2))
 
-    @property
-    def _number_count(self) -> int:
-        """Number of `LawNumbers.constants`."""
-        return 2 + self.law.shape_count if self.law else 0
-
     def _build_numbers(self, config: KernelConfig) -> Callable[..., Any]:
         """Build the Taichi function numbers_of(sheet, family, length), the list of `LawNumbers.constants`."""
-        ti, count, first = config.ti, self._number_count, config.first_constant(SpringTerm) + FIRST_NUMBER
-        of_length = config.curved and count > 0
+        ti, laws, of_length = config.ti, config.constants(SpringTerm).laws, config.curved and self.law is not None
 
         @ti.func
         def numbers_of(sheet: ti.template(), family: ti.template(), length):
             if ti.static(of_length):
-                others = [sheet.constants[first + count * family + n] for n in ti.static(range(1, count))]
-                return [sheet.constants[first + count * family] / length] + others  # noqa: RUF005
+                others = [sheet.constants[n] for n in ti.static(range(laws[family].first + 1, laws[family].end))]
+                return [sheet.constants[laws[family].first] / length] + others  # noqa: RUF005
             else:  # noqa: RET505  # Taichi would compile the rest as well.
-                return [sheet.constants[first + count * family + n] for n in ti.static(range(count))]
+                return [sheet.constants[n] for n in ti.static(range(laws[family].first, laws[family].end))]
 
         return numbers_of
 
-    def _build_field(self, config: KernelConfig, first: int) -> Callable[..., Any]:
-        """Build the Taichi function that reads a field of a family, see `build_stiffness`; `first` is that of rows."""
+    def _build_field(self, config: KernelConfig, places: range) -> Callable[..., Any]:
+        """Build the Taichi function that reads the field of a family, see `build_stiffness`, among their `places`."""
         ti = config.ti
 
         @ti.func
         def of_spring(sheet: ti.template(), family: ti.template(), falls, i, b):
-            field = first + family
+            field = places.start + family
             if ti.static(family == DIAGONAL):
-                field = first + ti.select(falls, FALLING, RISING)
+                field = places.start + ti.select(falls, FALLING, RISING)
             return sheet.fields[(field * sheet.rows + i) * sheet.width + b]
 
         return of_spring
@@ -216,19 +223,22 @@ class SpringTerm(Term):
         Entry b of row i is the left or upper end of a spring along a row or column, or the upper left corner of the
         cell of a diagonal, which falls to the right or rises.
         """
-        ti, real, first = config.ti, config.real, config.first_constant(SpringTerm)
-        varied, by_area, read = self.varied, self.by_area, self._build_field(config, config.first_field(SpringTerm))
+        ti, real, constants = config.ti, config.real, config.constants(SpringTerm).stiffness
+        varied, by_area = self.varied, self.by_area
+        read = self._build_field(config, config.fields(SpringTerm).stiffness)
 
         @ti.func
         def stiffness(sheet: ti.template(), family: ti.template(), falls, i, kind, b):
             if ti.static(varied):
                 return read(sheet, family, falls, i, b)
             elif ti.static(by_area and family == ALONG_ROW):  # noqa: RET505
-                return sheet.constants[first + ALONG_ROW] * ti.select(kind == 1, ti.cast(1, real), ti.cast(0.5, real))
+                return sheet.constants[constants[ALONG_ROW]] * ti.select(
+                    kind == 1, ti.cast(1, real), ti.cast(0.5, real)
+                )
             elif ti.static(by_area and family == ALONG_COLUMN):
-                return sheet.constants[first + ALONG_COLUMN] * sheet.by_column[(AREA_SHARE + 1) * sheet.width + b]
+                return sheet.constants[constants[ALONG_COLUMN]] * sheet.by_column[COLUMN_SHARE * sheet.width + b]
             else:
-                return sheet.constants[first + family]
+                return sheet.constants[constants[family]]
 
         return stiffness
 
@@ -237,9 +247,9 @@ class SpringTerm(Term):
 
         Along an open edge it is half, as the spring belongs to one cell instead of two.
         """
-        ti, real, first = config.ti, config.real, config.first_constant(SpringTerm) + FIRST_TENSION
+        ti, real, constants = config.ti, config.real, config.constants(SpringTerm).tension
         varied, edges = self.varied and self.tense, self.tense_edges
-        read = self._build_field(config, config.first_field(SpringTerm) + FAMILIES)
+        read = self._build_field(config, config.fields(SpringTerm).tension)
 
         @ti.func
         def tension(sheet: ti.template(), family: ti.template(), falls, i, kind, b, exists):
@@ -247,28 +257,24 @@ class SpringTerm(Term):
                 return read(sheet, family, falls, i, b) * exists
             elif ti.static(edges and family == ALONG_ROW):  # noqa: RET505
                 share = ti.select(kind == 1, ti.cast(1, real), ti.cast(0.5, real))
-                return sheet.constants[first + ALONG_ROW] * (exists * share)
+                return sheet.constants[constants[ALONG_ROW]] * (exists * share)
             elif ti.static(edges and family == ALONG_COLUMN):
-                return sheet.constants[first + ALONG_COLUMN] * (
-                    exists * sheet.by_column[(AREA_SHARE + 1) * sheet.width + b]
-                )
+                share = sheet.by_column[COLUMN_SHARE * sheet.width + b]
+                return sheet.constants[constants[ALONG_COLUMN]] * (exists * share)
             elif ti.static(edges):
-                return sheet.constants[first + DIAGONAL] * exists
+                return sheet.constants[constants[DIAGONAL]] * exists
             else:
-                return sheet.constants[first + family]
+                return sheet.constants[constants[family]]
 
         return tension
 
     def build_spring_forces(self, config: KernelConfig) -> tuple[Callable[..., Any], Callable[..., Any]]:
-        """Build the Taichi functions for the force of a mass point with displacement `u` on a neighbour [N].
+        """Build two Taichi functions for the force of a mass point with displacement `u` on a neighbour [N].
 
+        force_on_right(sheet, pair, entry, b, u, exists) is for the right neighbour, and force_on_other(sheet, pair,
+        entry, right, b, u, exists) for a neighbour in the other row of a `RowPair`, `right` columns to the right.
         `entry` is that of the neighbour in u, b that of the mass point in its row, and `exists` is 1, or 0 for a spring
         beyond an edge.
-
-        Returns:
-            force_on_right(sheet, pair, entry, b, u, exists) for the right neighbour;
-            force_on_other(sheet, pair, entry, right, b, u, exists) for a neighbour in the other row of a `RowPair`,
-            `right` columns to the right.
         """
         ti, vector, tense, curved = config.ti, config.vector, self.tense, config.curved
         open_edges, tense_edges = self.open_edges, self.tense_edges
@@ -377,11 +383,11 @@ class SpringTerm(Term):
 
         The map from p to this change is symmetric.
         """
-        ti, tense, count = config.ti, self.tense, self._number_count
+        ti, tense = config.ti, self.tense
         derivatives = build_spring(self.law, config.operations, tense=tense).derivatives
-        first_tension, numbers_of = config.first_constant(SpringTerm) + FIRST_TENSION, self._build_numbers(config)
+        tensions, numbers_of = config.constants(SpringTerm).tension, self._build_numbers(config)
         # One derivative by log m, and one by each number of the shape.
-        by_count = max(0, count - 1)
+        by_count = 1 + self.law.shape_count if self.law else 0
 
         @ti.func
         def differentiate(
@@ -392,7 +398,7 @@ class SpringTerm(Term):
             square = edge[0] * edge[0] + edge[1] * edge[1] + (edge[2] * edge[2] + MIN_SQUARED_LENGTH)
             square_difference = q[0] * (edge[0] + x0) + (q[1] * (edge[1] + y0) + q[2] * q[2])
             along = edge[0] * p[0] + edge[1] * p[1] + edge[2] * p[2]
-            tension, numbers = sheet.constants[first_tension + family], numbers_of(sheet, family, length)
+            tension, numbers = sheet.constants[tensions[family]], numbers_of(sheet, family, length)
             of_spring = ti.static(derivatives(k, tension, square_difference, square, length, along, numbers))
             isotropic, axial, by_k = of_spring[0], of_spring[1], of_spring[2]
             if ti.static(tense):
@@ -420,8 +426,8 @@ class SpringTerm(Term):
             u = ti.static(entry.u)
             b, largest = entry.b, vector(0)
             # Springs beyond an edge do not exist.
-            has_left = sheet.by_column[HAS_LEFT * sheet.width + b]
-            has_right = sheet.by_column[HAS_RIGHT * sheet.width + b]
+            has_left = sheet.by_column[BY_COLUMN.has_left * sheet.width + b]
+            has_right = sheet.by_column[BY_COLUMN.has_right * sheet.width + b]
             dx, dy = sheet.constants[DX], sheet.constants[DY]
             at, below = row.i * sheet.width + b, (row.i + 1) * sheet.width + b
             pair = ti.static(RowPair(row.i, row.kind, row.i + 1, row.i, 0 - dy, ti.sqrt(dx * dx + dy * dy)))
@@ -441,7 +447,7 @@ class SpringTerm(Term):
 
     def build_measures(self, config: KernelConfig) -> Sequence[Callable[..., None]]:
         ti = config.ti
-        tense, open_edges, vector, first = self.tense, self.open_edges, config.vector, config.first_measure(SpringTerm)
+        tense, open_edges, vector, places = self.tense, self.open_edges, config.vector, config.measures(SpringTerm)
         varied, curved = self.varied, config.curved
         stiffness_of, tension_of = self.build_stiffness(config), self._build_tension(config)
         numbers_of, rest_position = self._build_numbers(config), build_point_functions(config).rest_position
@@ -481,7 +487,8 @@ class SpringTerm(Term):
                         exists, left, falls = vector(1), b + ti.static(min(right, 0)), ti.static(right > 0)
                         if ti.static(open_edges and right != 0):
                             # Springs beyond the edge do not exist.
-                            exists = sheet.by_column[ti.static(HAS_LEFT if right < 0 else HAS_RIGHT) * sheet.width + b]
+                            side = ti.static(BY_COLUMN.has_left if right < 0 else BY_COLUMN.has_right)
+                            exists = sheet.by_column[side * sheet.width + b]
                         k = vector(0) + stiffness_of(sheet, family, falls, i, kind, left)
                         tension = vector(0) + tension_of(sheet, family, falls, i, kind, left, exists)
                         strain, motion, square = strains(
@@ -491,8 +498,8 @@ class SpringTerm(Term):
                             exists = ti.select(k + tension > 0, exists, vector(0))
                         if ti.static(varied or open_edges):
                             strain = ti.select(exists > 0, strain, vector(0))
-                        measures[first + MIN_STRAIN] = ti.min(measures[first + MIN_STRAIN], strain)
-                        measures[first + MAX_STRAIN] = ti.max(measures[first + MAX_STRAIN], strain)
+                        measures[places.min_strain] = ti.min(measures[places.min_strain], strain)
+                        measures[places.max_strain] = ti.max(measures[places.max_strain], strain)
                         stretch = energy(k, tension, strain, numbers_of(sheet, family, ti.sqrt(square)))
                         if ti.static(tense):
                             motion = ti.select(exists > 0, motion, vector(0)) * tension
@@ -500,9 +507,9 @@ class SpringTerm(Term):
                             stretch, motion = stretch * square, motion * square
                         stretch_sum += stretch
                         tension_sum += motion
-                    measures[first + STRETCH_SUMS + family] += stretch_sum
+                    measures[places.stretch[family]] += stretch_sum
                     if ti.static(tense):
-                        measures[first + TENSION_SUMS + family] += tension_sum
+                        measures[places.tension[family]] += tension_sum
 
         return (measure,)
 
@@ -551,15 +558,9 @@ def assemble_springs(material: Material, points: tuple[int, int]) -> Springs:
 
 
 def spring_stiffness(material: Material, factors: NDArray[Any]) -> tuple[NDArray[Any], NDArray[Any], NDArray[Any]]:
-    """Assemble the stiffness k of every spring from the factors of its cells.
+    """Return the stiffness k of every spring [N/m], for factors of the cells, shape (rows - 1, cols - 1).
 
-    Args:
-        material: coefficients of the sheet.
-        factors: factors of the map, shape (rows - 1, cols - 1).
-
-    Returns:
-        Stiffness [N/m] of springs along rows, shape (rows, cols - 1), along columns, shape (rows - 1, cols), and along
-        both diagonals of a cell, shape (rows - 1, cols - 1).
+    The shapes are those of `Springs` for springs along rows, along columns and along both diagonals of a cell.
     """
     above_and_below, left_and_right = np.pad(factors, ((1, 1), (0, 0))), np.pad(factors, ((0, 0), (1, 1)))
     across = material.across / 2 * (above_and_below[:-1] + above_and_below[1:])

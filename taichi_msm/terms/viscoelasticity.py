@@ -27,10 +27,11 @@ from taichi_msm.model.loads import Schedule
 from taichi_msm.model.plan import Plan
 from taichi_msm.scene.scene import Scene
 from taichi_msm.terms.base import KernelConfig, Term
+from taichi_msm.terms.places import Places
 
-# Columns of the load table: the factor of f; in quasi-static scenes 1 if the memory changes, else 0; for each branch
-# g = 1 - exp(-x) and c = share phi, with which s decreases by g (s + c f). exp(-x) in f32 would lose digits of small x.
-FACTOR, UPDATE, BRANCHES, BRANCH_COLUMNS = 0, 1, 2, 2
+# Columns of a branch: g = 1 - exp(-x) and c = share phi, with which s decreases by g (s + c f). exp(-x) in f32 would
+# lose digits of small x.
+BRANCH = Places(decrease=1, share=1)
 
 
 @dataclass(frozen=True)
@@ -40,7 +41,7 @@ class ViscoelasticTerm(Term):
     key: ClassVar[str] = "tissue.relaxation"
 
     branches: int  # number of branches
-    at_rest: bool  # whether the memory changes only at frames, as marked in the load table
+    by_frame: bool  # whether the memory changes only at frames, as marked in the load table
 
     @staticmethod
     def derive(scene: Scene) -> dict[str, Any]:
@@ -57,44 +58,47 @@ class ViscoelasticTerm(Term):
         return tuple(f"relaxation {n} {axis}" for n in range(self.branches) for axis in "xyz")
 
     @property
-    def column_count(self) -> int:
-        return BRANCHES + BRANCH_COLUMNS * self.branches
+    def field_places(self) -> Places:
+        return Places(memory=[3] * self.branches)
+
+    @property
+    def column_places(self) -> Places:
+        # The factor of f; with `by_frame` 1 if the memory changes, else 0.
+        return Places(factor=1, update=1, branches=[BRANCH] * self.branches)
 
     def columns(self, plan: Plan, loads: Schedule, first: int) -> NDArray[Any]:
-        h = 1 / plan.grid.frames_per_second if self.at_rest else plan.grid.step
+        h = 1 / plan.grid.frames_per_second if self.by_frame else plan.grid.step
         shares, times = np.array(plan.material.relaxation).T
         decrease = -np.expm1(-h / times)
         phi = decrease / (h / times)
-        columns = np.empty((len(loads.active), self.column_count))
-        columns[:, FACTOR], columns[:, UPDATE] = 1 - shares.sum() + (shares * phi).sum(), 0
-        columns[:, BRANCHES::2], columns[:, BRANCHES + 1 :: 2] = decrease, shares * phi
-        if self.at_rest and first == 0:
-            columns[:, FACTOR], columns[:, BRANCHES + 1 :: 2] = 1, shares * (phi - 1 + decrease) / decrease
-        return columns
+        factor, share = 1 - shares.sum() + (shares * phi).sum(), shares * phi
+        if self.by_frame and first == 0:
+            factor, share = 1, shares * (phi - 1 + decrease) / decrease
+        row = factor, 0.0, *np.stack([decrease, share], axis=1).ravel()
+        return np.tile(row, (len(loads.active), 1))
 
     def mark_update(self, columns: NDArray[Any]) -> bool:
-        columns[UPDATE] = 1
+        columns[self.column_places.update] = 1
         return True
 
     def build_forces(self, config: KernelConfig) -> Sequence[Callable[..., Any]]:
-        ti, first, branches, at_rest = config.ti, config.first_column(ViscoelasticTerm), self.branches, self.at_rest
-        first_field = config.first_field(ViscoelasticTerm)
+        ti, columns, by_frame = config.ti, config.columns(ViscoelasticTerm), self.by_frame
+        memory = config.fields(ViscoelasticTerm).memory
 
         @ti.func
         def relax(force: ti.template(), sheet: ti.template(), entry: ti.template(), now: ti.template()):
             at = entry.row.i * sheet.width + entry.b
             for c in ti.static(range(3)):
                 elastic = force[c]
-                force[c] = elastic * now[first + FACTOR]
-                for n in ti.static(range(branches)):
-                    index = (first_field + 3 * n + c) * sheet.rows * sheet.width + at
-                    column = ti.static(first + BRANCHES + BRANCH_COLUMNS * n)
+                force[c] = elastic * now[columns.factor]
+                for n, branch in ti.static(enumerate(columns.branches)):
+                    index = memory[n][c] * sheet.rows * sheet.width + at
                     s = sheet.fields[index]
                     force[c] += s
-                    if ti.static(at_rest):
-                        if now[first + UPDATE] > 0:
-                            sheet.fields[index] = s - now[column] * (s + now[column + 1] * elastic)
+                    if ti.static(by_frame):
+                        if now[columns.update] > 0:
+                            sheet.fields[index] = s - now[branch.decrease] * (s + now[branch.share] * elastic)
                     else:
-                        sheet.fields[index] = s - now[column] * (s + now[column + 1] * elastic)
+                        sheet.fields[index] = s - now[branch.decrease] * (s + now[branch.share] * elastic)
 
         return (relax,)

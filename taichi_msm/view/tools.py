@@ -13,7 +13,7 @@ import numpy as np
 
 from taichi_msm.model.plan import Plan
 from taichi_msm.model.tool_force import control_points
-from taichi_msm.model.tools import Tool, build_tools, overlap
+from taichi_msm.model.tools import SolidTool, build_tools, overlap, solid_tools
 from taichi_msm.scene.scene import Scene
 from taichi_msm.scene.sheet import Sheet
 from taichi_msm.scene.tools import Probe
@@ -48,15 +48,16 @@ def clear_start(probe: Probe, scene_probes: Sequence[Probe], scene: Scene) -> Sh
     return CENTRE
 
 
-def _capsule(probe: Probe, sheet: Sheet) -> Tool:
+def _capsule(probe: Probe, sheet: Sheet) -> SolidTool:
     """Build a capsule with the motion of a probe's instrument; a force-controlled one stays on the sheet at rest."""
     assert probe.instrument is not None
     capsule = probe.instrument.model_copy(update={"radius": probe.instrument.outer_radius, "plate": None})
-    (tool,) = build_tools([Probe(path=probe.path or ((0.0, *CENTRE, 0.0),), instrument=capsule)], sheet)
+    tools = build_tools([Probe(path=probe.path or ((0.0, *CENTRE, 0.0),), instrument=capsule)], sheet)
+    (tool,) = solid_tools(tools).values()
     if probe.path is None:
         times, points = control_points(probe, sheet)
-        heights = np.full(len(times), tool.tip_centres[0, 2])
-        tool = replace(tool, times=times, tip_centres=np.column_stack([points, heights]))
+        heights = np.full(len(times), tool.path[0, 2])
+        tool = replace(tool, times=times, path=np.column_stack([points, heights]))
     return tool
 
 

@@ -27,7 +27,6 @@ from taichi_msm.accuracy.time_step import TimeStepEstimate, choose_step, combine
 from taichi_msm.errors import SceneError
 from taichi_msm.model.plan import Plan
 from taichi_msm.model.tools import overlap, path_warnings
-from taichi_msm.model.verlet import convergence_order
 from taichi_msm.runs.run import run
 from taichi_msm.scene.scene import Scene
 from taichi_msm.solver.dynamics import Dynamics
@@ -153,9 +152,9 @@ def test_chosen_step_meets_the_tolerance(case: list[dict[str, Any]], device: Dev
 
 
 def test_order_1_and_margin_of_a_fine_companion(monkeypatch: pytest.MonkeyPatch, device: Device) -> None:
-    assert convergence_order(plan_of(touching([]))) == 2
+    assert plan_of(touching([])).convergence_order == 2
     plan = plan_of(touching([PRESSED], time={"step": 0.005}))
-    assert convergence_order(plan) == 1
+    assert plan.convergence_order == 1
     monkeypatch.setattr(time_step, "Dynamics", partial(PowerLaw, 1))
     assert estimate_error(plan, device).error == pytest.approx(1.25 * 1.5 * 0.005 / (1 + 0.005 / 2), rel=1e-9)
 

@@ -7,6 +7,7 @@ from numpy.typing import NDArray
 
 from taichi_msm.model.plan import Plan
 from taichi_msm.model.sheet import rest_positions
+from taichi_msm.model.tools import SolidTool, solid_tools
 from tests.reference.sheet import sheet
 
 Array = NDArray[np.float64]
@@ -58,7 +59,7 @@ class Contact:
             holder = self.holder[i, j]
             for tool in plan.tools:
                 index = tool.probe
-                before, after = (tool.tip_centre(np.array([step / grid.steps_per_second]))[0] for step in (n, n + 1))
+                before, after = (tool.path_at(np.array([step / grid.steps_per_second]))[0] for step in (n, n + 1))
                 push = np.zeros(3)
                 if holder == index and index in self._clamps:
                     keys = np.array(plan.scene.probes[index].path)
@@ -66,7 +67,7 @@ class Contact:
                     push = [np.interp(t, keys[:, 0], keys[:, 1 + axis]) for axis in range(3)] - following[i, j]
                 elif holder == index:
                     push = self._grip_displacement[i, j] + after - self._grip_centre[index] - following[i, j]
-                elif holder < 0 and index not in self._clamps:
+                elif holder < 0 and isinstance(tool, SolidTool):
                     r = self._rest[i, j] + following[i, j] - after
                     r -= np.clip(r @ tool.axis, 0, tool.length) * tool.axis
                     distance = float(np.linalg.norm(r))
@@ -92,7 +93,7 @@ class Contact:
         plan, grid = self._plan, self._plan.grid
         t, tolerance = n / grid.steps_per_second, 1e-6 / grid.frames_per_second
         grips = {}
-        tools = [tool for tool in plan.tools if tool.probe not in self._clamps]
+        tools = solid_tools(plan.tools).values()
         for tool in tools:
             active = [k for k, (begin, end) in enumerate(tool.grips) if begin - tolerance <= t < end - tolerance]
             grips[tool.probe] = active[0] if active else None
@@ -102,7 +103,7 @@ class Contact:
                 self.holder[self.holder == probe] = -1
         for tool in tools:
             if tool.probe in begun:
-                centre = tool.tip_centre(np.array([t]))[0]
+                centre = tool.path_at(np.array([t]))[0]
                 near = np.linalg.norm(self._rest + u - centre, axis=-1) <= 1.5 * tool.radius
                 gripped = near & ~plan.fixed & (self.holder < 0)
                 self.holder[gripped] = tool.probe

@@ -14,6 +14,7 @@ from scipy.sparse.linalg import spsolve
 from taichi_msm.model.loads import Schedule
 from taichi_msm.model.plan import Plan
 from taichi_msm.model.sheet import rest_positions
+from taichi_msm.model.tools import solid_tools
 from taichi_msm.scene.scene import Scene
 from tests.reference.dynamics import energy, force, surgical_force, tangent
 from tests.reference.sheet import sheet
@@ -41,7 +42,7 @@ def clearance(plan: Plan, displacement: Array, time: float) -> Array:
         displacement: u [m], shape (rows, cols, 3).
         time: time of the tools' poses [s].
     """
-    radii = np.array([tool.radius for tool in plan.tools])
+    radii = np.array([tool.radius for tool in solid_tools(plan.tools).values()])
     return np.linalg.norm(_from_axes(plan, displacement, time), axis=-1) - radii[:, None, None]
 
 
@@ -59,9 +60,10 @@ def outward(plan: Plan, displacement: Array, time: float) -> Array:
 
 def _from_axes(plan: Plan, displacement: Array, time: float) -> Array:
     position = rest_positions(plan.scene.sheet) + displacement
-    offsets = np.empty((len(plan.tools), *displacement.shape))
-    for n, tool in enumerate(plan.tools):
-        r = position - tool.tip_centre(np.array([time]))[0]
+    tools = solid_tools(plan.tools)
+    offsets = np.empty((len(tools), *displacement.shape))
+    for n, tool in enumerate(tools.values()):
+        r = position - tool.path_at(np.array([time]))[0]
         offsets[n] = r - np.clip(r @ tool.axis, 0, tool.length)[..., None] * tool.axis
     return offsets
 

@@ -10,6 +10,7 @@ from scipy.optimize import brentq, minimize_scalar
 
 from taichi_msm.model.loads import evaluate_frame_loads
 from taichi_msm.model.plan import Plan
+from taichi_msm.model.tools import solid_tools
 from tests.reference.dynamics import force
 from tests.reference.rest import clearance, equilibrium, outward
 
@@ -56,7 +57,7 @@ def rough_frames(plan: Plan, start: Array) -> Iterator[tuple[Array, Array, NDArr
 
 
 def _centre(plan: Plan, time: float) -> Array:
-    return plan.tools[0].tip_centre(np.array([time]))[0]
+    return plan.tools[0].path_at(np.array([time]))[0]
 
 
 def _first_touch(
@@ -68,7 +69,7 @@ def _first_touch(
         u = before + share * (after - before)
         return float(clearance(plan, u, times[0] + share * (times[1] - times[0]))[0][point])
 
-    if gap(0) <= 1e-9 * plan.tools[0].radius:
+    if gap(0) <= 1e-9 * solid_tools(plan.tools)[0].radius:
         return 0.0
     nearest = 1.0 if gap(1) < 0 else float(minimize_scalar(gap, bounds=(0, 1), method="bounded").x)
     return float(brentq(gap, 0, nearest, xtol=1e-14)) if gap(nearest) < 0 else None

@@ -14,7 +14,7 @@ from taichi_msm.errors import DivergedError
 from taichi_msm.model.loads import evaluate_frame_loads
 from taichi_msm.model.plan import Plan
 from taichi_msm.model.sheet import rest_positions
-from taichi_msm.model.tools import path_warnings
+from taichi_msm.model.tools import path_warnings, solid_tools
 from taichi_msm.runs.simulation import Simulation
 from taichi_msm.scene.scene import Scene
 from taichi_msm.solver import rest as rest_module
@@ -129,9 +129,9 @@ def test_grip_matches_scipy(device: Device) -> None:
     plan = plan_of(at_rest([tool], time={"duration": 3}))
     rest = QuasiStatics(plan, device)
     rest.advance(1)
-    before, tip = rest.displacement(), plan.tools[0]
+    before, tip = rest.displacement(), solid_tools(plan.tools)[0]
     rest.advance(1)
-    u, middle = rest.displacement(), tip.tip_centre(np.array([1.0, 2.0]))
+    u, middle = rest.displacement(), tip.path_at(np.array([1.0, 2.0]))
     held = np.linalg.norm(rest_positions(plan.scene.sheet) + before - middle[0], axis=-1) <= 1.5 * tip.radius
     assert held.sum() > 4
     moved_by = np.where(held[..., None], before + middle[1] - middle[0], 0)

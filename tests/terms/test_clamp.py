@@ -137,7 +137,7 @@ def test_flat_sheet_after_return(device: Device) -> None:
 def test_intermediate_shapes() -> None:
     """A clamp advances by half the shortest spring at most; rows are 37.5 mm apart, columns 40 mm."""
     (clamp,) = plan_of(at_rest([PULL], sheet=LEFT)).tools
-    fast = replace(clamp, tip_centres=np.array([[0, 0, 0], [0.1, 0, 0], [0, 0, 0]]))
+    fast = replace(clamp, path=np.array([[0, 0, 0], [0.1, 0, 0], [0, 0, 0]]))
     assert len(clamp.substep_times(0, 1)) == 2 - (np.hypot(0.02, np.hypot(0.005, 0.01)) <= 0.0375 / 2)
     assert len(fast.substep_times(0, 1)) == 6
 
