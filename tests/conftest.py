@@ -148,8 +148,12 @@ def stereo(stereo_run: Path, tmp_path: Path) -> Path:
 
 @pytest.fixture(autouse=True)
 def handlers() -> Iterator[None]:
-    """Restore the signal handlers, which the command line replaces."""
+    """Handle signals as in a shell's foreground, and restore the handlers, which the command line replaces."""
     before = {number: signal.getsignal(number) for number in SIGNALS}
+    for number in SIGNALS:
+        # A shell's background, and nohup, ignore signals in all processes that they start.
+        if before[number] is signal.SIG_IGN:
+            signal.signal(number, signal.default_int_handler if number == signal.SIGINT else signal.SIG_DFL)
     yield
     for number, handler in before.items():
         signal.signal(number, handler)

@@ -15,7 +15,7 @@ from taichi_msm.system.process import discard_buffer, write_stderr
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run a command, by default that of sys.argv; return an exit code of `common`, 130 (Ctrl-C) or 143 (SIGTERM)."""
+    """Run a command, by default that of sys.argv; return an exit code of `common`, or 128 + a signal."""
     words = list(sys.argv[1:] if arguments is None else arguments)
     try:
         code, lines = _run(words)

@@ -113,6 +113,8 @@ def fit(
         problem, settings = _read_problem(observed, initial, free, bounds or {}, forces, method)
     with ExitStack() as stack:
         if directory is not None:
+            # From here on an interruption is an exception, which removes the unfinished files.
+            progress("fit", 0, 1)
             stack.enter_context(writing(directory))
             publisher = stack.enter_context(publication(Path(directory)))
         if settings is not None:

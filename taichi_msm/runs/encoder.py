@@ -10,7 +10,6 @@ import gc
 import math
 import os
 import pickle
-import signal
 import subprocess
 import sys
 import time
@@ -29,6 +28,7 @@ from taichi_msm.errors import FilesError
 from taichi_msm.runs.directory import create_file
 from taichi_msm.runs.media import GifWriter, Mp4Writer, Palette, Picture, predict_colours
 from taichi_msm.scene.outputs import OUTPUTS
+from taichi_msm.system.process import ignore_signals
 
 
 class EncodingJob(NamedTuple):
@@ -218,9 +218,7 @@ class Encoder:
 def main() -> None:
     """Run the child process: read a job and its pictures from stdin, write the report to stdout."""
     result: EncodingReport | Exception
-    # Ignore signals that a service manager sends to all processes: this one ends when the parent closes its stdin.
-    signal.signal(signal.SIGTERM, signal.SIG_IGN)
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    ignore_signals()  # ends when the parent closes its stdin
     try:
         result = _encode_stream()
     except (OSError, FilesError) as error:

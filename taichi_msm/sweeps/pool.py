@@ -20,6 +20,7 @@ from threading import Lock, Thread, get_ident
 from typing import Any
 
 from taichi_msm.errors import MsmError
+from taichi_msm.system.process import ignore_signals
 
 # Interval at which a process checks that its parent is alive [s].
 PARENT_POLL_S = 0.2
@@ -125,7 +126,7 @@ def _exit_reason(code: int) -> str:
 
 def serve() -> None:
     """Execute the calls from stdin until the parent closes the pipe or dies; the main function of a process."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    ignore_signals()
     Thread(target=_exit_with_parent, args=[os.getppid()], daemon=True).start()
     answers = os.fdopen(os.dup(1), "wb")
     # What libraries print on stdout must not mix with the answers.

@@ -1,7 +1,7 @@
 """Resources and signals of this process: cores, memory, interruption, standard streams.
 
 By default Python raises KeyboardInterrupt between any two bytecodes. Imports, destructors and callbacks of libraries
-lose it or convert it to another error. So Ctrl-C and SIGTERM only record a request, and the program raises
+lose it or convert it to another error. So Ctrl-C, SIGTERM and SIGHUP only record a request, and the program raises
 KeyboardInterrupt at places where it can stop.
 """
 
@@ -14,7 +14,7 @@ import platform
 import signal
 import sys
 import threading
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from types import FrameType
@@ -107,14 +107,15 @@ def _group_memory(group: Path) -> int:
     return sys.maxsize
 
 
-SIGNALS = (signal.SIGINT, signal.SIGTERM)
+# Ctrl-C, the end of a service, and that of a terminal, which Windows lacks.
+SIGNALS = tuple(getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGHUP") if hasattr(signal, name))
 
 # A descriptor of stderr that works even while `discarded_output` redirects stderr.
 _stderr_copy = 2
 
 
 class Interruption:
-    """A pending interruption by Ctrl-C or SIGTERM; a second signal ends the process at once.
+    """A pending interruption by a signal; a second signal ends the process at once.
 
     Attributes:
         code: exit code of an interrupted program, 128 plus the number of the signal.
@@ -126,8 +127,7 @@ class Interruption:
 
     def listen(self) -> None:
         """Record signals from now on, instead of ending the process."""
-        for number in SIGNALS:
-            signal.signal(number, self._request)
+        _handle_signals(self._request)
 
     def raise_if_requested(self) -> None:
         """Raise KeyboardInterrupt if a signal arrived since `listen`."""
@@ -145,8 +145,20 @@ def exit_on_signals() -> None:
     """End the process at once on a signal, for the time before any results exist."""
     global _stderr_copy
     _stderr_copy = os.dup(2)
+    _handle_signals(_exit_on_signal)
+
+
+def ignore_signals() -> None:
+    """Ignore the signals of a terminal or a service to all processes, for one that ends with its parent."""
     for number in SIGNALS:
-        signal.signal(number, _exit_on_signal)
+        signal.signal(number, signal.SIG_IGN)
+
+
+def _handle_signals(handler: Callable[[int, FrameType | None], None]) -> None:
+    """Set the handler of all signals, except those that nohup or a shell's background ignores."""
+    for number in SIGNALS:
+        if signal.getsignal(number) is not signal.SIG_IGN:
+            signal.signal(number, handler)
 
 
 def _exit_on_signal(number: int, _frame: FrameType | None) -> None:

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import signal
+import subprocess
 import sys
 import zipfile
 from concurrent.futures import Future
@@ -35,6 +37,7 @@ from taichi_msm.system.runtime import Device
 from tests.conftest import Program
 from tests.fitting.conftest import with_keys
 from tests.golden import Messages
+from tests.reporting_process import ReportingProcess
 
 Array = NDArray[np.float64]
 
@@ -401,6 +404,22 @@ def test_an_interrupted_fit_leaves_no_files(tracks: Arrays, tmp_path: Path) -> N
     with pytest.raises(KeyboardInterrupt):
         fit(changed(tissue__young=3e4), tracks, [YOUNG], directory=tmp_path / "fit", progress=stop)
     assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGHUP])
+def test_a_signal_leaves_no_files(number: signal.Signals, tracks: Arrays, small: Path) -> None:
+    (small / "press.yaml").write_text(yaml.safe_dump(TRUTH))
+    save(small / "tracks.npz", tracks)
+    command = ["fit", "press.yaml", "tracks.npz", "--free", YOUNG, "--set", "tissue.young=3e4", "--out", "out"]
+    with ReportingProcess(*command, stderr=subprocess.PIPE) as process:
+        # As soon as there are files, and before the first run.
+        while not (small / "out/.partial/lock").exists():
+            assert process.poll() is None
+        process.send_signal(number)
+        _, errors = process.communicate(timeout=60)
+    assert process.returncode == 128 + number
+    assert "interrupted; nothing was written" in errors
+    assert not (small / "out").exists()
 
 
 def test_files_of_the_command(tracks: Arrays, small: Path, program: Program, message: Messages) -> None:
