@@ -191,7 +191,14 @@ def test_tables_are_complete() -> None:
     assert sorted(words(table(DOCS / "files.md", "record"))) == sorted(get_type_hints(RunRecord))
     assert words(table(DOCS / "error.md", "estimate")) == list(get_type_hints(ErrorRecord))
     assert sorted(words(table(DOCS / "export.md", "formats"))) == sorted(FORMATS)
-    codes = {common.DONE, common.BUG, common.INVALID_INPUT, common.DIVERGED, common.FILES, 130, 143}
+    codes = {
+        common.DONE,
+        common.BUG,
+        common.INVALID_INPUT,
+        common.DIVERGED,
+        common.FILES,
+        *(128 + number for number in process.SIGNALS),
+    }
     assert re.findall(r"\d+", " ".join(table(DOCS / "command-line.md", "exit codes"))) == [*map(str, sorted(codes))]
 
 

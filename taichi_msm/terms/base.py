@@ -72,7 +72,12 @@ class Term(ABC):
 
     @classmethod
     def node_stiffness_bounds(cls, material: Material, sheet: Sheet) -> NDArray[Any] | float:
-        """Bound the term's stiffness at each mass point [N/m], shape (rows, cols) or ()."""
+        """Return an upper bound of the term's stiffness at each mass point [N/m], shape (rows, cols) or ().
+
+        Args:
+            material: coefficients of the sheet.
+            sheet: section `sheet` of the scene.
+        """
         return cls.stiffness_bound(material, sheet)
 
     def constants(self, plan: Plan) -> tuple[float, ...]:

@@ -24,6 +24,7 @@ from taichi_msm.errors import DivergedError
 from taichi_msm.load.scene_file import load_scene
 from taichi_msm.system import runtime
 from taichi_msm.system.compiler import active_compiler
+from taichi_msm.system.process import Interruption
 from tests import reference
 from tests.conftest import Program
 from tests.golden import Messages
@@ -183,6 +184,19 @@ def test_signal_before_the_first_frame_changes_nothing(
     message(error.splitlines()[-1])
     assert [path.name for path in (small / "out").iterdir()] == ["run.json"]
     assert (small / "out" / "run.json").read_text() == earlier
+
+
+def test_ignored_signals_stay_ignored() -> None:
+    """A shell's background ignores SIGINT, and nohup SIGHUP."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    interruption = Interruption()
+    interruption.listen()
+    signal.raise_signal(signal.SIGINT)
+    interruption.raise_if_requested()
+    signal.raise_signal(signal.SIGHUP)
+    with pytest.raises(KeyboardInterrupt):
+        interruption.raise_if_requested()
+    assert interruption.code == 128 + signal.SIGHUP
 
 
 @pytest.mark.slow

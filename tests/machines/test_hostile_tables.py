@@ -139,6 +139,11 @@ def workbooks() -> Iterator[Case]:
         yield name, content, []
 
 
+def test_workbook_without_hostile_parts_is_read(tmp_path: Path) -> None:
+    (tmp_path / "table.xlsx").write_bytes(workbook())
+    assert len(read_machine_test(tmp_path / "table.xlsx").time) == 12
+
+
 def answer(connection: Connection, forces: bool) -> None:
     """Read the tables of a connection; answer with an empty text, or with an error other than a SceneError."""
     while request := connection.recv():

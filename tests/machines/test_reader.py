@@ -319,7 +319,7 @@ FAULTS: dict[str, tuple[str | bytes, list[str], list[str]]] = {
     "zero byte": (TABLE.replace("0.250", "0.25\0"), [], ["csv:7", "zero byte"]),
     "tiny times": (HEADER + "\n" + rows(line="{t}e-300{s}{d}{s}{f}"), [], ["csv:1", "Time [s]", "1.1e-300 s"]),
     "tiny depths": (HEADER + "\n" + rows(line="{t}{s}{d}e-300{s}{f}"), [], ["csv:1", "Depth [mm]", "1.1e-303 m"]),
-    "tiny forces": (HEADER + "\n" + rows(line="{t}{s}{d}{s}{f}e-320"), [], ["csv:1", "Force [N]", "5.5e-321 N"]),
+    "tiny forces": (HEADER + "\n" + rows(line="{t}{s}{d}{s}{f}e-300"), [], ["csv:1", "Force [N]", "5.5e-301 N"]),
     "column of no quantity": (TABLE, ["strain=Strain, mm"], ["--columns", "strain"]),
     "column chosen twice": (TABLE, ["depth=Depth", "depth=Time"], ["--columns", "depth"]),
     "time of another unit": (TABLE.replace("[s]", "[ms]"), ["time=Time [s]"], ["csv:1", "Time [s]"]),
@@ -452,11 +452,22 @@ def test_faults_of_a_sheet(name: str, save: Save, message: Messages) -> None:
     assert len(caught.value.lines) == 1
 
 
-def test_large_workbook(save: Save, monkeypatch: pytest.MonkeyPatch, message: Messages) -> None:
-    path = save({"FF2": SHEET})
-    monkeypatch.setattr("taichi_msm.machines.workbook.MAX_UNPACKED_BYTES", 1000)
-    with message.raises(SceneError, "tests.xlsx", "1,000 bytes"):
+LIMITS = "UNPACKED_BYTES MARKS CELLS CHARACTERS DEPTH NAMES TAG_BYTES CELL_CHARACTERS SHEETS STYLES MERGED"
+
+
+@pytest.mark.parametrize("limit", LIMITS.split())
+def test_limits_of_a_workbook(limit: str, save: Save, monkeypatch: pytest.MonkeyPatch, message: Messages) -> None:
+    path = save({"FF2": SHEET}, lambda book: [book["FF2"].merge_cells(f"B{row}:C{row}") for row in (90, 91)])
+    monkeypatch.setattr("taichi_msm.machines.workbook.CHUNK_BYTES", 50)
+    monkeypatch.setattr(f"taichi_msm.machines.workbook.MAX_{limit}", 0)
+    with message.raises(SceneError, "tests.xlsx", "more than 0"):
         read_machine_test(path)
+
+
+def test_too_many_lines(read: Read, monkeypatch: pytest.MonkeyPatch, message: Messages) -> None:
+    monkeypatch.setattr("taichi_msm.machines.cells.MAX_LINES", 10)
+    with message.raises(SceneError, "test.csv", "13 lines"):
+        read(TABLE)
 
 
 def damage(data: bytes, rng: random.Random) -> bytes:

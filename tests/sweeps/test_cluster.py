@@ -54,13 +54,19 @@ runpy.run_module("taichi_msm", run_name="__main__")
 # A worker with this module never ends run 3.
 GATE = """
 import time
+from functools import wraps
 from taichi_msm.sweeps import cluster
-execute = cluster._execute_run
-def gated(name, run, *arguments):
-    while run == 3:
-        time.sleep(1)
-    return execute(name, run, *arguments)
-cluster._execute_run = gated
+
+def dask_setup(worker):
+    execute = cluster._execute_run
+
+    @wraps(execute)
+    def gated(name, run, *arguments):
+        while run == 3:
+            time.sleep(1)
+        return execute(name, run, *arguments)
+
+    cluster._execute_run = gated
 """
 
 
