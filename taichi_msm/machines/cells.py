@@ -186,15 +186,7 @@ def _split_line(line: str, separator: str) -> Row:
 
 
 def read_bytes(name: str, expected: str) -> bytes:
-    """Return the content of a file of at most `MAX_BYTES`.
-
-    Args:
-        name: path of the file.
-        expected: description of a readable file, for messages.
-
-    Raises:
-        SceneError: when the file cannot be read.
-    """
+    """Return the content of a file of at most `MAX_BYTES`; messages call a readable one `expected`."""
     try:
         if not (reason := irregular_kind(Path(name))):
             if (size := Path(name).stat().st_size) <= MAX_BYTES:

@@ -58,27 +58,21 @@ class Launch(NamedTuple):
     max_checks: Any  # number of checks after which a waiting worker ends
 
 
-WORKERS, LAUNCH_SIZES = Launch._fields.index("workers"), len(Launch._fields)
+# Places of the arguments. Kernels read each where they need it: as variables, they cost up to 4 % of a step.
+AT = Launch(*range(len(Launch._fields)))
 
 
 class RowBand(NamedTuple):
-    """A worker's band of rows within a kernel. Row 0 is the first one that the worker steps, at its border BEGIN."""
+    """A worker's band of rows within a kernel."""
 
     worker: Any  # index of the worker
     workers: Any  # number of workers
-    low: Any  # first row of the sheet in the band
-    high: Any  # row of the sheet after the last of the band
+    low: Any  # first row of the band
+    high: Any  # row after the last of the band
     direction: Any  # 1 if the worker moves down, -1 if up
     rows: Any  # number of rows of the sheet
-
-
-class BandStep(NamedTuple):
-    """A step of a band within a kernel."""
-
-    n: Any  # row of the load table
-    before: Any  # number of steps taken before this one in the run
-    carry: Any  # row of `carried`
-    moments: Any  # first row of the worker's moments in u
+    max_checks: Any  # number of checks after which a waiting worker ends
+    progress: Any  # array of all workers
 
 
 def build_fill_halo(config: KernelConfig) -> Callable[..., None]:
@@ -97,207 +91,170 @@ def build_fill_halo(config: KernelConfig) -> Callable[..., None]:
     return fill_halo
 
 
-@ti.func
-def _row_of(band: ti.template(), row):
-    """Return the row of the sheet that is row `row` of a band."""
-    return ti.select(band.direction > 0, band.low, band.high - 1) + row * band.direction
-
-
-@ti.func
-def _copy_at(band: ti.template(), reach: ti.template(), worker, border, n, behind):
-    """Return the index in u of a copy of a worker's row, `behind` rows inward from a border, after n steps."""
-    return band.rows + reach * (4 * worker + 2 * border + ti.cast(n % 2, ti.i32)) + behind
-
-
 def build_step_row(
     config: KernelConfig, move: Callable[..., None], *, corrects: bool, parallel: bool
-) -> Callable[..., None]:
-    """Build the Taichi function step_row(sheet, carried, loads, band, step, row), which steps a row of a `RowBand`.
+) -> Callable[..., Any]:
+    """Build the Taichi function step_row(sheet, carried, loads, band, row, n, steps_before, carry, moments).
 
-    `move` steps an entry, see `build_pass_row`; the corrections of terms follow if it `corrects`. With `parallel`, the
-    rows beyond the borders are the neighbours' copies, which must be available.
+    It steps a row of a band as soon as the neighbours' rows are available. `move` steps an entry, see `build_pass_row`;
+    the corrections of terms follow if it `corrects`; `parallel` bands have neighbours.
     """
-    vector, real, bending, reach = config.vector, config.real, config.get(BendingTerm), config.reach
+    vector, bending, copied = config.vector, config.get(BendingTerm), config.reach
     fill_halo = build_fill_halo(config)
     pass_row, storing = build_pass_row(config, move), [bending.build_store_moment(config)] if bending else []
     corrections = [term.build_correction(config) for term in config.terms if corrects]
     correcting = [build_correct_row(config, correction) for correction in corrections if correction]
 
     @ti.func
-    def stored_at(band: ti.template(), row, i, n):
-        """Return the index in u of a row in or next to a band after n steps: i, or that of a neighbour's copy."""
-        stored = i
-        if ti.static(parallel):
-            before, after = band.worker - band.direction, band.worker + band.direction
-            if row < 0 and 0 <= before < band.workers:
-                stored = _copy_at(band, reach, before, BEGIN, n, -1 - row)
-            if row >= band.high - band.low and 0 <= after < band.workers:
-                stored = _copy_at(band, reach, after, END, n, row - (band.high - band.low))
-        return stored
+    def copy_at(rows, worker, border, n, behind):
+        """Return the index in u of a copy of a worker's row, `behind` rows inward from a border, after n steps."""
+        return rows + copied * (4 * worker + 2 * border + ti.cast(n % 2, ti.i32)) + behind
 
     @ti.func
     def row_at(band: ti.template(), row, n):
         """Return the index in u of a row in or next to a band, after n steps; any index for a row beyond the sheet."""
-        return stored_at(band, row, ti.max(0, ti.min(_row_of(band, row), band.rows - 1)), n)
+        i = ti.select(band.direction > 0, band.low, band.high - 1) + row * band.direction
+        stored = ti.max(0, ti.min(i, band.rows - 1))
+        if ti.static(parallel):
+            if row < 0 and 0 <= band.worker - band.direction < band.workers:
+                stored = copy_at(band.rows, band.worker - band.direction, BEGIN, n, -1 - row)
+            if row >= band.high - band.low and 0 <= band.worker + band.direction < band.workers:
+                stored = copy_at(band.rows, band.worker + band.direction, END, n, row - (band.high - band.low))
+        return stored
 
     @ti.func
-    def store_moments(sheet: ti.template(), band: ti.template(), step: ti.template(), row):
+    def wait_for(band: ti.template(), worker, border, n):
+        """Wait until a worker has taken n steps at a border; return False after `max_checks` checks."""
+        steps = ti.atomic_add(band.progress[WORKER_STRIDE * worker + COUNTER_STRIDE * border], 0)
+        checks = 0
+        while steps < n and checks < band.max_checks:
+            steps = ti.atomic_add(band.progress[WORKER_STRIDE * worker + COUNTER_STRIDE * border], 0)
+            checks += 1
+        return steps >= n
+
+    @ti.func
+    def publish(sheet: ti.template(), band: ti.template(), border, i, inward, n):
+        """Copy row i after n steps, and with bending the next row inward, for the neighbour at a border."""
+        for behind in ti.static(range(copied)):
+            copy = copy_at(band.rows, band.worker, border, n, behind)
+            for b in range(sheet.width):
+                for c in ti.static(range(3)):
+                    sheet.u[c][copy * sheet.width + b] = sheet.u[c][(i + behind * inward) * sheet.width + b]
+        ti.atomic_add(band.progress[WORKER_STRIDE * band.worker + COUNTER_STRIDE * border], 1)
+
+    @ti.func
+    def store_moments(sheet: ti.template(), band: ti.template(), row, moments, n):
         """Store the moments of the next row; at the start of a band also those of the rows -1 and 0."""
+        begin = ti.select(band.direction > 0, band.low, band.high - 1)
         for ahead in range(ti.select(row < 0, -1, row + 1), row + 2):
-            before, middle = row_at(band, ahead - 1, step.before), row_at(band, ahead, step.before)
-            after, target = row_at(band, ahead + 1, step.before), step.moments + (ahead + MOMENT_ROWS) % MOMENT_ROWS
+            before, middle = row_at(band, ahead - 1, n), row_at(band, ahead, n)
+            after, target = row_at(band, ahead + 1, n), moments + (ahead + MOMENT_ROWS) % MOMENT_ROWS
             for b in range(1, sheet.width - 1):
                 for store_moment in ti.static(storing):
-                    store_moment(sheet, _row_of(band, ahead), before, middle, after, b, target)
+                    store_moment(sheet, begin + ahead * band.direction, before, middle, after, b, target)
             fill_halo(sheet.u, target, sheet.width)
 
     @ti.func
     def step_row(
-        sheet: ti.template(), carried: ti.template(), loads: ti.template(), band: ti.template(), step: ti.template(),
-        row,
+        sheet: ti.template(), carried: ti.template(), loads: ti.template(), band: ti.template(),
+        row, n, steps_before, carry, moments,
     ):  # fmt: skip
-        """Step a row of a band; only compute the forces of row -1, which precedes the first one."""
-        if ti.static(len(storing) > 0):
-            store_moments(sheet, band, step, row)
-        i = _row_of(band, row)
-        if 0 <= i < band.rows:
-            kind = ti.select(i == band.rows - 1, 2, ti.select(i == 0, 0, 1))
-            before, middle = step.moments + (row + 2) % MOMENT_ROWS, step.moments + row % MOMENT_ROWS
-            after = step.moments + (row + 1) % MOMENT_ROWS
-            line = ti.static(KernelRow(i, kind, before, middle, after))
-            exists = ti.cast(0 <= i + band.direction < band.rows, real)
-            source = i
-            next_row = ti.select(exists > 0, i + band.direction, i)
-            if ti.static(parallel):
-                source = stored_at(band, row, i, step.before)
-                next_row = stored_at(band, row + 1, next_row, step.before)
-            up = -band.direction * sheet.constants[DY]
-            pass_row(sheet, carried, step.carry, line, source, next_row, exists, up, loads, step.n, row >= 0)
+        """Step a row of a band, from 0 at its beginning; return False after a timeout.
+
+        Row -1 precedes the band, and only its forces are computed. n is the row of `loads`, `steps_before` the number
+        of steps taken in the run, `carry` the row of `carried`, and `moments` the first row of the worker's moments.
+        """
+        begin = ti.select(band.direction > 0, band.low, band.high - 1)
+        begin_worker, end_worker = band.worker - band.direction, band.worker + band.direction
+        last = band.high - band.low - 1
+        i = begin + row * band.direction
+        source = i
+        next_row = i + band.direction
+        exists = ti.cast(0 <= next_row < band.rows, config.real)
+        ready = True
+        if ti.static(parallel):
+            if row == -1 and 0 <= begin_worker < band.workers:
+                ready = wait_for(band, begin_worker, BEGIN, steps_before)
+                source = copy_at(band.rows, begin_worker, BEGIN, steps_before, 0)
+            # With bending, the step depends on one more row.
+            if ready and row > last - copied and 0 <= end_worker < band.workers:
+                ready = wait_for(band, end_worker, END, steps_before)
+            if row == last and 0 <= end_worker < band.workers:
+                next_row = copy_at(band.rows, end_worker, END, steps_before, 0)
+        if ready:
+            if ti.static(len(storing) > 0):
+                store_moments(sheet, band, row, moments, steps_before)
+            next_row = ti.select(exists > 0, next_row, i)
+            if 0 <= i < band.rows:
+                kind = ti.select(i == band.rows - 1, 2, ti.select(i == 0, 0, 1))
+                up = -band.direction * sheet.constants[DY]
+                before, middle = moments + (row + 2) % MOMENT_ROWS, moments + row % MOMENT_ROWS
+                after = moments + (row + 1) % MOMENT_ROWS
+                line = ti.static(KernelRow(i, kind, before, middle, after))
+                pass_row(sheet, carried, carry, line, source, next_row, exists, up, loads, n, row >= 0)
+                if row >= 0:
+                    for correct_row in ti.static(correcting):
+                        correct_row(sheet, i, kind, loads, n)
+            else:
+                for b in range(1, sheet.width - 1):
+                    for c in ti.static(range(3)):
+                        carried[c][carry * sheet.width + b] = vector(0)
             if row >= 0:
-                for correct_row in ti.static(correcting):
-                    correct_row(sheet, i, kind, loads, step.n)
-        else:
-            for b in range(1, sheet.width - 1):
-                for c in ti.static(range(3)):
-                    carried[c][step.carry * sheet.width + b] = vector(0)
-        if row >= 0:
-            fill_halo(sheet.u, i, sheet.width)
+                fill_halo(sheet.u, i, sheet.width)
+            if ti.static(parallel):
+                # Copy as soon as all rows to be copied are stepped.
+                if row == copied - 1:
+                    publish(sheet, band, BEGIN, begin, band.direction, steps_before + 1)
+                if row == last:
+                    publish(sheet, band, END, i, -band.direction, steps_before + 1)
+        return ready
 
     return step_row
-
-
-def _build_meeting(reach: int) -> tuple[Callable[..., Any], Callable[..., None]]:
-    """Build the Taichi functions with which workers meet at their borders.
-
-    await_row(progress, band, row, n, max_checks) waits until the neighbours have taken the n steps on which the next
-    step of a row depends; it returns False after a timeout. publish_row(sheet, progress, band, row, n) copies the rows
-    at a border for the neighbour there, when a row has been stepped for the n-th time.
-    """
-
-    @ti.func
-    def await_worker(progress: ti.template(), band: ti.template(), worker, border, n, max_checks):
-        """Wait until a worker, if it exists, has taken n steps at a border."""
-        ready = True
-        if 0 <= worker < band.workers:
-            at = WORKER_STRIDE * worker + COUNTER_STRIDE * border
-            steps = ti.atomic_add(progress[at], 0)
-            checks = 0
-            while steps < n and checks < max_checks:
-                steps = ti.atomic_add(progress[at], 0)
-                checks += 1
-            ready = steps >= n
-        return ready
-
-    @ti.func
-    def await_row(progress: ti.template(), band: ti.template(), row, n, max_checks):
-        ready = True
-        if row == -1:
-            ready = await_worker(progress, band, band.worker - band.direction, BEGIN, n, max_checks)
-        # With bending, a step depends on one more row.
-        if ready and row > band.high - band.low - 1 - reach:
-            ready = await_worker(progress, band, band.worker + band.direction, END, n, max_checks)
-        return ready
-
-    @ti.func
-    def publish(sheet: ti.template(), progress: ti.template(), band: ti.template(), border, row, inward, n):
-        for behind in ti.static(range(reach)):
-            copy, i = _copy_at(band, reach, band.worker, border, n, behind), _row_of(band, row + behind * inward)
-            for b in range(sheet.width):
-                for c in ti.static(range(3)):
-                    sheet.u[c][copy * sheet.width + b] = sheet.u[c][i * sheet.width + b]
-        ti.atomic_add(progress[WORKER_STRIDE * band.worker + COUNTER_STRIDE * border], 1)
-
-    @ti.func
-    def publish_row(sheet: ti.template(), progress: ti.template(), band: ti.template(), row, n):
-        # As soon as all rows to be copied are stepped.
-        if row == reach - 1:
-            publish(sheet, progress, band, BEGIN, 0, 1, n)
-        if row == band.high - band.low - 1:
-            publish(sheet, progress, band, END, row, -1, n)
-
-    return await_row, publish_row
-
-
-def _build_align_stack(config: KernelConfig) -> Callable[..., Any]:
-    """Build the Taichi function align_stack(m, n), which returns True.
-
-    Its vector with a variable index makes the compiler align the stack, and with it all spilled vectors, which saves up
-    to 7 % of a step.
-    """
-    vector, lanes = config.vector, config.lanes
-
-    @ti.func
-    def align_stack(m, n):
-        aligned = vector(0)
-        aligned[m % lanes] = 1
-        return aligned[n % lanes] >= 0
-
-    return align_stack
 
 
 @cache
 def build_advance(config: KernelConfig, *, parallel: bool) -> Callable[..., None]:
     """Build the kernel of `kernel_cpu.ScatterKernel` that takes steps, `parallel` with several workers."""
-    real, vector, vectors, constant_count = config.real, config.vector, config.vectors, config.constants().end
+    real, vector, vectors, lanes = config.real, config.vector, config.vectors, config.lanes
+    constant_count = config.constants().end
     step_row = build_step_row(config, build_point_step(config), corrects=True, parallel=parallel)
-    (await_row, publish_row), align_stack = _build_meeting(config.reach), _build_align_stack(config)
 
     @ti.func
     def step_band(
-        sheet: ti.template(), carried: ti.template(), loads: ti.template(), launch: ti.template(),
-        progress: ti.template(), band: ti.template(),
-    ):  # fmt: skip
+        sheet: ti.template(), carried: ti.template(), loads: ti.template(), band: ti.template(), sizes: ti.template()
+    ):
         """Advance a band by the steps of a launch, from its worker's recorded progress on; record the new progress."""
-        own, count, depth, band_rows = WORKER_STRIDE * band.worker, launch.count, launch.depth, band.high - band.low
-        moments = launch.moment_row + MOMENT_ROWS * band.worker
-        pass_index = ti.cast(progress[own + PASS_INDEX], ti.i32)
-        k = ti.cast(progress[own + ROUND], ti.i32)
-        j = ti.cast(progress[own + STEP], ti.i32)
-        ready = align_stack(band.workers, count)
+        first, own = sizes[AT.steps_before], WORKER_STRIDE * band.worker
+        count, depth = ti.cast(sizes[AT.count], ti.i32), ti.cast(sizes[AT.depth], ti.i32)
+        carried_rows = ti.cast(sizes[AT.carried_rows], ti.i32)
+        moments = ti.cast(sizes[AT.moment_row], ti.i32) + MOMENT_ROWS * band.worker
+        pass_index = ti.cast(band.progress[own + PASS_INDEX], ti.i32)
+        k = ti.cast(band.progress[own + ROUND], ti.i32)
+        step = ti.cast(band.progress[own + STEP], ti.i32)
+        # A vector with a variable index makes the compiler align the stack, and with it all spilled vectors, which
+        # saves up to 7 % of a step. `ready` is always True here.
+        aligned = vector(0)
+        aligned[band.workers % lanes] = 1
+        ready = aligned[count % lanes] >= 0
         while ready and pass_index * depth < count:
             steps = ti.min(depth, count - pass_index * depth)
-            while ready and k < band_rows + steps - 1:
-                while ready and j < ti.min(steps, k + 2):
-                    n = pass_index * depth + j
-                    before, carry, row = launch.steps_before + n, band.worker * launch.carried_rows + j, k - j
-                    if ti.static(parallel):
-                        ready = await_row(progress, band, row, before, launch.max_checks)
+            while ready and k < band.high - band.low + steps - 1:
+                while ready and step < ti.min(steps, k + 2):
+                    n = pass_index * depth + step
+                    carry = band.worker * carried_rows + step
+                    ready = step_row(sheet, carried, loads, band, k - step, n, first + n, carry, moments)
                     if ready:
-                        step = ti.static(BandStep(n, before, carry, moments))
-                        step_row(sheet, carried, loads, band, step, row)
-                        if ti.static(parallel):
-                            publish_row(sheet, progress, band, row, before + 1)
-                        j += 1
+                        step += 1
                 if ready:
                     k += 1
-                    j = ti.max(0, k - band_rows + 1)
+                    step = ti.max(0, k - (band.high - band.low) + 1)
             if ready:
                 pass_index += 1
                 k = -1
-                j = 0
-        progress[own + PASS_INDEX] = pass_index
-        progress[own + ROUND] = k
-        progress[own + STEP] = j
+                step = 0
+        band.progress[own + PASS_INDEX] = pass_index
+        band.progress[own + ROUND] = k
+        band.progress[own + STEP] = step
 
     @ti.kernel
     def advance(
@@ -314,23 +271,21 @@ def build_advance(config: KernelConfig, *, parallel: bool) -> Callable[..., None
         row [N] have rows per worker and step of a pass. `SheetArrays.all` are the other arrays.
         """
         ti.loop_config(serialize=not parallel)
-        for index in range(ti.cast(sizes[WORKERS], ti.i32) * ITERATIONS_PER_THREAD):
+        for index in range(ti.cast(sizes[AT.workers], ti.i32) * ITERATIONS_PER_THREAD):
             # One worker per thread.
             if index % ITERATIONS_PER_THREAD == 0:
-                steps_before = sizes[0]
-                others = [ti.cast(sizes[n], ti.i32) for n in ti.static(range(1, LAUNCH_SIZES))]
-                launch = ti.static(Launch(steps_before, *others))
+                rows, width = ti.cast(sizes[AT.rows], ti.i32), ti.cast(sizes[AT.strip], ti.i32) + 2
                 constants = [constants_of[n][0] for n in ti.static(range(constant_count))]
                 u, d = ti.static((u_x, u_y, u_z), (d_x, d_y, d_z))
-                width = launch.strip + 2
-                sheet = ti.static(KernelSheet(u, d, by_column, fields, constants, launch.rows, width))
-                worker, workers = index // ITERATIONS_PER_THREAD, launch.workers
-                first_row, end_row = launch.first_row, launch.end_row
+                sheet = ti.static(KernelSheet(u, d, by_column, fields, constants, rows, width))
+                worker, workers = index // ITERATIONS_PER_THREAD, ti.cast(sizes[AT.workers], ti.i32)
+                first_row, end_row = ti.cast(sizes[AT.first_row], ti.i32), ti.cast(sizes[AT.end_row], ti.i32)
                 low = first_row + (end_row - first_row) * worker // workers
                 high = first_row + (end_row - first_row) * (worker + 1) // workers
                 direction = 2 * (worker % 2) - 1
-                band = ti.static(RowBand(worker, workers, low, high, direction, launch.rows))
+                max_checks = ti.cast(sizes[AT.max_checks], ti.i32)
+                band = ti.static(RowBand(worker, workers, low, high, direction, rows, max_checks, progress))
                 carried = ti.static((carried_x, carried_y, carried_z))
-                step_band(sheet, carried, loads, launch, progress, band)
+                step_band(sheet, carried, loads, band, sizes)
 
     return advance

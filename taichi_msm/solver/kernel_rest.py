@@ -36,7 +36,7 @@ from taichi_msm.solver.arrays import (
     build_read,
     to_lanes,
 )
-from taichi_msm.solver.bands import MOMENT_ROWS, BandStep, RowBand, build_fill_halo, build_step_row
+from taichi_msm.solver.bands import MOMENT_ROWS, RowBand, build_fill_halo, build_step_row
 from taichi_msm.system.runtime import compilation_options, ti, write_vectors
 from taichi_msm.terms.base import Entry, KernelConfig, KernelRow, KernelSheet, RestCorrection
 from taichi_msm.terms.bending import BendingTerm
@@ -200,9 +200,8 @@ def _build_relax(config: KernelConfig) -> Callable[..., None]:
         """Evaluate the forces on all mass points and their reductions."""
         for n in range(sheet.rows * sheet.width, (sheet.rows + SUMS) * sheet.width):
             sheet.work[n] = vector(0)
-        step = ti.static(BandStep(0, 0, sheet.rows + moments, sheet.rows))
         for line in range(-1, band.high - band.low):
-            step_row(sheet, sheet.u, row, band, step, line)
+            step_row(sheet, sheet.u, row, band, line, 0, 0, sheet.rows + moments, sheet.rows)
 
     @ti.func
     def move_points(sheet: ti.template(), row: ti.template(), band: ti.template(), keep, gain, dt, back):
@@ -256,7 +255,7 @@ def _build_relax(config: KernelConfig) -> Callable[..., None]:
             constants = [constants_of[n][0] for n in ti.static(range(constant_count))]
             u, forces, q = ti.static((u_x, u_y, u_z), (d_x, d_y, d_z), (q_x, q_y, q_z))
             sheet = ti.static(RestSheet(u, forces, by_column, fields, constants, rows, width, q, work))
-            band = ti.static(RowBand(0, 1, low, high, 1, rows))
+            band = ti.static(RowBand(0, 1, low, high, 1, rows, 0, fire))
             if fire[PLACED] > 0:
                 for i in range(low, high):
                     settle_row(sheet, row, i)

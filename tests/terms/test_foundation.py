@@ -129,10 +129,12 @@ def test_record_of_foundation_and_maps(device: Device) -> None:
 
 @pytest.mark.usefixtures("folder")
 def test_warning_beyond_a_third_of_the_depth(device: Device, message: Messages) -> None:
-    made = tissue((9, 9), foundation={"young": 15e3, "depth": 0.03})
+    made = tissue((9, 9), foundation={"young": 15e3, "depth": 0.03}, probes=[TOOL])
     assert not notes_of(made, RunProgress(1, max_displacement=0.02, deepest=0.0099), None)
     message(notes_of(made, RunProgress(1, 0.02, deepest=0.0101), None), "tissue.foundation.depth")
-    assert not notes_of(tissue((9, 9), foundation=5e5), RunProgress(1, 0.02, deepest=0.02), None), "unknown depth"
+    assert not notes_of(tissue((9, 9), foundation=5e5, probes=[TOOL]), RunProgress(1, 0.02, deepest=0.02), None), (
+        "unknown depth"
+    )
     soft = ["tissue.foundation={young: 1.5e3, depth: 5e-3}", "probes.0.falloff=300"]
     record = run(load_scene("s.yaml", soft), "out", threads=device.threads, estimate_error=False)
     deepest = -float(np.load("out/trajectory.npz")["position"][..., 2].min())
