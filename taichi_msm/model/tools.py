@@ -102,7 +102,7 @@ class Tool(ABC):
 
     @abstractmethod
     def problems(self, scene: Scene, grid: TimeGrid) -> Iterator[Problem]:
-        """Yield problems of the path and of what the tool holds or touches."""
+        """Yield problems of the path and of the mass points that the tool holds or touches."""
 
     @abstractmethod
     def warnings(self, scene: Scene) -> Iterator[str]:
