@@ -33,7 +33,7 @@ from taichi_msm.errors import ArgumentError, FilesError, NotInstalledError, requ
 from taichi_msm.runs.arrays import read_flo
 from taichi_msm.scene.outputs import OUTPUTS
 
-REPEAT = "remove what is left of this run, and run the sweep again"
+REPEAT = "remove the files of this run, and run the sweep again"
 
 
 class Pair(TypedDict):

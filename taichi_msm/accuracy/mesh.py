@@ -62,8 +62,8 @@ CONTACT_ERROR_FACTOR = 1.2  # estimated error, as a multiple of the difference
 SECOND_RUN_DIFFERENCE = 0.3  # difference above which a second companion run follows, if affordable
 UNRELIABLE_DIFFERENCE = 0.4  # difference above which the error is unknown without the second one
 MAX_DIFFERENCE_RATIO = 8.0  # largest meaningful difference of the first companion run, relative to the second's
-# Estimated error, as a multiple of the geometric mean of both differences; with grips, which hold other points on every
-# mesh, as much as with one difference.
+# Estimated error, as a multiple of the geometric mean of both differences. Grips hold other points on every mesh, and
+# have the factor of a single difference.
 SECOND_ERROR_FACTOR, SECOND_GRIP_ERROR_FACTOR = 0.8, 1.2
 MAX_DIFFERENCE = 1.0  # largest meaningful difference from the last companion run
 MIN_RADIUS_CELLS = 0.8  # smallest meaningful radius of a tool, in cells of the run

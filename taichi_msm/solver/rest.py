@@ -49,7 +49,8 @@ FORCE_TOLERANCE, PERTURBATION_TOLERANCE, STABILITY_TOLERANCE = 1e-7, 1e-3, 1e-9
 MIN_FORCE_N = 1e-30
 
 # Largest number of evaluations per mass point along the longer side, for a law without stiffening; a sheet that buckles
-# takes up to 200. The fictitious masses are those of the locked sheet, so the others take up to sqrt(factor) as many.
+# takes up to 200. The fictitious masses are those of the locked sheet, which multiplies the evaluations by up to
+# sqrt(factor).
 MAX_EVALUATIONS = 2000
 
 Array = NDArray[np.float64]
@@ -231,7 +232,7 @@ class QuasiStatics(SheetSolver[Relaxation]):
             if force <= min(target, tolerance * scale):
                 converged = tolerance == FORCE_TOLERANCE
                 if converged and not is_first and evaluations < stability_evaluations and self._may_be_unstable():
-                    # An instability shows within these evaluations. A buckled shape may take as many as the first.
+                    # An instability shows within these evaluations. A buckled shape has the same limit once more.
                     tolerance, stability_evaluations = STABILITY_TOLERANCE, min(4 * evaluations, limit)
                     max_evaluations = 2 * limit
                     continue
