@@ -42,6 +42,6 @@ def buckling_warnings(plan: Plan, progress: RunProgress) -> Iterator[str]:
 
 def _is_symmetric(plan: Plan) -> bool:
     """Return whether the mirror image of a motion, at the plane of the sheet at rest, is a solution, too."""
-    forces = [probe.total or probe.force or (0, 0, 0) for probe in plan.scene.probes if probe.path is None]
+    forces = [probe.vector or (0, 0, 0) for probe in plan.scene.probes if probe.path is None]
     crosses = any(force[2] != 0 for force in forces) or any(tool.path[:, 2].any() for tool in plan.tools)
     return not crosses and not solid_tools(plan.tools)

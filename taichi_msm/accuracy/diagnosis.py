@@ -12,7 +12,7 @@ from taichi_msm.accuracy import divergence
 from taichi_msm.accuracy.divergence import DivergenceMonitor
 from taichi_msm.errors import Pause
 from taichi_msm.model.plan import Plan
-from taichi_msm.model.sheet import axes
+from taichi_msm.model.rest import rest_of
 from taichi_msm.model.surface import to_positions
 from taichi_msm.model.tool_force import control_points, probe_force
 from taichi_msm.scene.scene import Scene
@@ -111,12 +111,12 @@ def _is_stable(dynamics: SheetSolver[Any], plan: Plan, frames: int, pause: Pause
 
 def _strongest_probe(scene: Scene, point: tuple[int, int]) -> tuple[int, float]:
     """Return the probe with the largest force on a mass point at any time, and this force [N]."""
-    x, y = axes(scene.sheet)
-    rest = np.array([x[point[1]], y[point[0], 0]])
+    rest = rest_of(scene.sheet)
+    position = rest.position[point]
 
     def force(index: int) -> float:
         probe = scene.probes[index]
-        distance = np.linalg.norm(control_points(probe, scene.sheet)[1] - rest, axis=1).min()
+        distance = np.linalg.norm(rest.place(control_points(probe, scene.sheet)[1]) - position, axis=1).min()
         profile, load = probe_force(probe, scene.sheet), max(abs(percent) for _, percent in probe.load) / 100
         return load * math.hypot(*profile.force) * float(profile.decay(distance))
 

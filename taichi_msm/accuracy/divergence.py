@@ -126,7 +126,7 @@ class DivergenceMonitor:
         ):
             return least, growth
         displacement = reading.displacement.astype(np.float64)
-        energy = reading.energy + foundation_energy(self._plan.material, self._lasting_stiffness, displacement)
+        energy = reading.energy + foundation_energy(self._plan, self._lasting_stiffness, displacement)
         # Energies below 1e-3 of the largest may grow by rounding, without effect on the result.
         if least > 0 and energy > max(least, 1e-3 * self.progress.peak):
             growth = max(growth, energy / least)

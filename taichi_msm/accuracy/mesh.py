@@ -134,7 +134,7 @@ def _with_equal_force(probe: Probe, sheet: Sheet, coarse: Sheet) -> Probe:
     force, coarse_force = sum_probe_forces(probe, sheet)[0], sum_probe_forces(probe, coarse)[0]
     if not 0.5 * coarse_force < force < 2 * coarse_force:
         return probe
-    return probe.model_copy(update={"total": tuple(force / coarse_force * part for part in probe.total)})
+    return probe.with_force(force / coarse_force)
 
 
 def _sampling_force_error(scene: Scene) -> float:

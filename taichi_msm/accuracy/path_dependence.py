@@ -22,6 +22,7 @@ from taichi_msm.accuracy.time_step import max_norm
 from taichi_msm.errors import DivergedError, Pause
 from taichi_msm.model.loads import FrameLoad
 from taichi_msm.model.plan import Plan
+from taichi_msm.model.rest import rest_of
 from taichi_msm.model.tools import grip_frames
 from taichi_msm.scene.tools import Probe
 from taichi_msm.solver.planning import affords_companions, plan_variant
@@ -146,8 +147,8 @@ def _load_at_once(plan: Plan, probe: Probe, frame: int) -> Probe:
     """Return a probe with the constant load of a frame, or with a straight path to its position at the frame."""
     rate, sheet = plan.grid.frames_per_second, plan.scene.sheet
     if probe.path is None:
-        percent, (x, y) = FrameLoad(probe, sheet).at(frame, rate)
-        at = (x / sheet.size[1] + 0.5, 0.5 - y / sheet.size[0])
+        percent, coordinates = FrameLoad(probe, sheet).at(frame, rate)
+        at = tuple(rest_of(sheet).fractions(coordinates).tolist())
         return probe.model_copy(update={"load": ((0.0, percent),), "at": at})
     times, *coordinates = np.array(probe.path, dtype=float).T
     position = (float(np.interp(frame / rate, times, each)) for each in coordinates)

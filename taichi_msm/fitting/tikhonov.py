@@ -57,8 +57,7 @@ class SmoothnessWeight(NamedTuple):
 def with_scaled_forces(scene: Scene, logs: Array) -> Scene:
     """Return a scene with scaled forces of all tools; `logs`: log of their common factor, shape (1,), or empty."""
     factor = float(np.exp(logs).prod())
-    totals = [probe.total and tuple(factor * component for component in probe.total) for probe in scene.probes]
-    probes = [probe.model_copy(update={"total": total}) for probe, total in zip(scene.probes, totals, strict=True)]
+    probes = [probe.with_force(factor) for probe in scene.probes]
     return scene.model_copy(update={"probes": tuple(probes)})
 
 

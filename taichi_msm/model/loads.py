@@ -19,8 +19,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from taichi_msm.model.plan import HAT_TOLERANCE, Plan, ProbeSegment, ProbeSlot, probe_slots
+from taichi_msm.model.rest import rest_of
 from taichi_msm.model.sheet import axes
-from taichi_msm.model.tool_force import control_points, point_at, probe_force
+from taichi_msm.model.tool_force import control_points, point_at, probe_directions, probe_force
 from taichi_msm.scene.scene import Scene
 from taichi_msm.scene.section import FRAME_TOLERANCE
 from taichi_msm.scene.sheet import Sheet
@@ -34,20 +35,19 @@ class Schedule(NamedTuple):
 
     slots: tuple[ProbeSlot, ...]  # the second axis of `strength` and `point`
     strength: Array  # force without decay [N], shape (steps, slots, 3)
-    point: Array  # control point, x and y at rest [m], shape (steps, slots, 2)
+    point: Array  # control point, `Rest.load_points` [m], shape (steps, slots, 2 or 3)
     active: Array  # factor of the virtual springs' stiffness, 0 to 1, shape (steps,)
 
 
 def decay(probe: Probe, plan: Plan, at: Array | None = None) -> Array:
     """Return the decay factor of a probe's force at each mass point, shape (rows, cols).
 
-    The factor of a probe with `total` includes the mass point's share of a cell's area. The control point is `at`, x
-    and y at rest [m], or by default the first keyframe of `probe.at`.
+    The factor of a probe with `total` includes the mass point's share of a cell's area. The coordinates of the control
+    point are `at`, by default those of the first keyframe of `probe.at`.
     """
     sheet = plan.scene.sheet
-    law, (at_x, at_y) = probe_force(probe, sheet), control_points(probe, sheet)[1][0] if at is None else at
-    x, y = axes(sheet)
-    factors = law.decay(np.hypot(x - at_x, y - at_y))
+    law, at = probe_force(probe, sheet), control_points(probe, sheet)[1][0] if at is None else at
+    factors = law.decay(rest_of(sheet).distances(at))
     return factors * plan.area_shares if law.by_area else factors
 
 
@@ -69,7 +69,7 @@ def average_loads(plan: Plan, first: int, count: int) -> Schedule:
     """Return the loads of `count` steps from the step `first` on, averaged with the hat function of each step."""
     scene, slots = plan.scene, plan.slots
     t, h = np.arange(first, first + count) / plan.grid.steps_per_second, plan.grid.step
-    strength, point = np.zeros((count, len(slots), 3)), np.zeros((count, len(slots), 2))
+    strength, coordinates = np.zeros((count, len(slots), 3)), np.zeros((count, len(slots), 2))
     for index in sorted({slot.probe for slot in slots}):
         probe, columns = scene.probes[index], [n for n, slot in enumerate(slots) if slot.probe == index]
         slot_count, segments, jumps = len(columns), slots[columns[0]].segments, slots[columns[0]].jumps
@@ -78,12 +78,12 @@ def average_loads(plan: Plan, first: int, count: int) -> Schedule:
             percents, numbers = load.averages(t, h)[:, None], np.zeros((count, 1), np.intp)
         else:
             percents, numbers = _distribute_over_slots(load, jumps, slot_count, t, h)
-        strength[:, columns] = np.multiply.outer(percents / 100, probe_force(probe, scene.sheet).force)
-        for n, segment_numbers in zip(columns, numbers.T, strict=True):
+        for n, percent, segment_numbers in zip(columns, percents.T, numbers.T, strict=True):
             for number in np.unique(segment_numbers):
                 steps = segment_numbers == number
-                point[steps, n] = _control_point(segments[number], t[steps])
-    return Schedule(slots, strength, point, _activity(plan).averages(t, h))
+                coordinates[steps, n] = _control_point(segments[number], t[steps])
+            strength[:, n] = percent[:, None] / 100 * probe_directions(probe, scene.sheet, coordinates[:, n])
+    return Schedule(slots, strength, _load_points(plan, coordinates), _activity(plan).averages(t, h))
 
 
 def evaluate_loads(plan: Plan, t: Array) -> Schedule:
@@ -93,15 +93,22 @@ def evaluate_loads(plan: Plan, t: Array) -> Schedule:
     """
     scene = plan.scene
     slots = plan.slots if scene.time.at_rest else probe_slots(scene.probes, scene.sheet, 0.0)
-    strength, point = np.zeros((len(t), len(slots), 3)), np.zeros((len(t), len(slots), 2))
+    strength, coordinates = np.zeros((len(t), len(slots), 3)), np.zeros((len(t), len(slots), 2))
     for n, slot in enumerate(slots):
         probe = scene.probes[slot.probe]
-        strength[:, n] = np.multiply.outer(_load(probe).values(t) / 100, probe_force(probe, scene.sheet).force)
         segment_numbers = slot.jumps.searchsorted(t, "right")
         for number in np.unique(segment_numbers):
             steps = segment_numbers == number
-            point[steps, n] = _control_point(slot.segments[number], t[steps])
-    return Schedule(slots, strength, point, _activity(plan).values(t))
+            coordinates[steps, n] = _control_point(slot.segments[number], t[steps])
+        percent = _load(probe).values(t)
+        strength[:, n] = percent[:, None] / 100 * probe_directions(probe, scene.sheet, coordinates[:, n])
+    return Schedule(slots, strength, _load_points(plan, coordinates), _activity(plan).values(t))
+
+
+def _load_points(plan: Plan, coordinates: Array) -> Array:
+    """Return `Rest.load_points` of control points, shape (steps, slots, 2 or 3), for coordinates (steps, slots, 2)."""
+    points = rest_of(plan.scene.sheet).load_points(coordinates.reshape(-1, 2))
+    return points.reshape(*coordinates.shape[:2], points.shape[1])
 
 
 class FrameLoad:
@@ -113,7 +120,7 @@ class FrameLoad:
         self._keys = np.unique(np.concatenate([self._line.times, self._times]))
 
     def at(self, frame: int, rate: float) -> tuple[float, Array]:
-        """Return the load [%] and the control point, x and y at rest [m], at a frame; at a jump, those after it."""
+        """Return the load [%] and the coordinates of the control point at a frame; at a jump, those after it."""
         time = frame / rate
         # Frame times are rounded, so a keyframe very close to the frame counts as at the frame.
         key = float(self._keys[max(0, self._keys.searchsorted(time + FRAME_TOLERANCE / rate, "right") - 1)])
@@ -262,7 +269,7 @@ def _distribute_over_slots(
 
 
 def _control_point(segment: ProbeSegment, t: Array) -> Array:
-    """Return the control point of a segment at times t [s], constant outside its keyframes [m], shape (times, 2)."""
+    """Return the coordinates of a segment at times t [s], constant outside its keyframes, shape (times, 2)."""
     return np.stack([np.interp(t, segment.times, segment.points[:, axis]) for axis in range(2)], axis=-1)
 
 

@@ -29,7 +29,7 @@ class ProbeSegment(NamedTuple):
     """The path of a control point between two jumps, constant before its first and after its last keyframe."""
 
     times: Array  # times of the keyframes [s], shape (n,)
-    points: Array  # control point at the keyframes, x and y at rest [m], shape (n, 2)
+    points: Array  # coordinates of the control point at the keyframes, see `Rest`, shape (n, 2)
 
 
 @dataclass(frozen=True)

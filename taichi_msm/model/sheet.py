@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 from taichi_msm.errors import Problem
 from taichi_msm.images import file_sha256, read_grey
 from taichi_msm.laws.law import LawNumbers
+from taichi_msm.model.rest import rest_of, sample_bilinearly
 from taichi_msm.scene.scene import Scene
 from taichi_msm.scene.section import MAX_POINTS, Side
 from taichi_msm.scene.sheet import Sheet, StiffnessMap
@@ -52,10 +53,8 @@ def axes(sheet: Sheet) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
 
 
 def rest_positions(sheet: Sheet) -> NDArray[np.float64]:
-    """Return the rest positions of the mass points, X_ij = (x_j, y_i, 0) [m], shape (rows, cols, 3)."""
-    position = np.zeros((*sheet.points, 3))
-    position[..., 0], position[..., 1] = axes(sheet)
-    return position
+    """Return the rest positions of the mass points [m], shape (rows, cols, 3)."""
+    return rest_of(sheet).position.copy()
 
 
 def fixed_points(sheet: Sheet) -> NDArray[np.bool_]:
@@ -106,6 +105,7 @@ class Springs(NamedTuple):
     stiffness: Sequence[Array]  # k of every spring [N/m]; 0 where there is none
     tension: Sequence[Array]  # tau, tension at rest per length [N/m]; in equilibrium
     rest: Array | None  # rest positions, shape (rows, cols, 3) [m]; None for a flat rectangle
+    bounds: Array  # bound of the stiffness of linear springs at every mass point [N/m], shape (rows, cols)
 
 
 @dataclass(frozen=True, eq=False)
@@ -167,17 +167,9 @@ def map_factors(stiffness_map: StiffnessMap, image: MapImage, rows: Array, cols:
 
     `rows`, shape (m,), and `cols`, shape (n,), are fractions of the height from the top and of the width from the left.
     """
-    grey = image.grey.astype(float)
-    height, width = grey.shape
-    row = np.clip(rows * height - 0.5, 0, height - 1)
-    column = np.clip(cols * width - 0.5, 0, width - 1)
-    top, left = row.astype(int), column.astype(int)
-    bottom, right = np.minimum(top + 1, height - 1), np.minimum(left + 1, width - 1)
-    down, across = (row - top)[:, None], column - left
-    above = grey[np.ix_(top, left)] * (1 - across) + grey[np.ix_(top, right)] * across
-    below = grey[np.ix_(bottom, left)] * (1 - across) + grey[np.ix_(bottom, right)] * across
     black, white = stiffness_map.range
-    return black + (white - black) / np.iinfo(image.grey.dtype).max * (above * (1 - down) + below * down)
+    grey = sample_bilinearly(image.grey.astype(float), rows, cols)
+    return black + (white - black) / np.iinfo(image.grey.dtype).max * grey
 
 
 def largest_mean(factors: Array) -> float:

@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from taichi_msm.model.sheet import axes
+from taichi_msm.model.rest import rest_of
 from taichi_msm.model.tool_force import control_point
 from taichi_msm.model.tools import build_tools, solid_tools, unit_vector
 from taichi_msm.scene.scene import Scene
@@ -21,25 +21,24 @@ Array = NDArray[np.float64]
 
 def to_positions(displacement: NDArray[Any], sheet: Sheet) -> NDArray[Any]:
     """Convert displacements [m], shape (rows, cols, 3), to positions in place, and make the array read-only."""
-    position, (x, y) = displacement, axes(sheet)
+    position, rest = displacement, rest_of(sheet)
     # The sum is computed in float64 and rounded once, without a float64 copy of the sheet.
-    np.add(position[..., 0], x, out=position[..., 0], casting="same_kind")
-    np.add(position[..., 1], y, out=position[..., 1], casting="same_kind")
+    for c in range(2 if rest.is_flat else 3):
+        np.add(position[..., c], rest.position[..., c], out=position[..., c], casting="same_kind")
     position.flags.writeable = False
     return position
 
 
-def surface_point(position: NDArray[np.floating], refine: int, sheet: Sheet, rest: Array) -> tuple[Array, Array]:
-    """Find the point of the refined surface with a given rest position, x and y [m].
+def surface_point(position: NDArray[np.floating], refine: int, sheet: Sheet, at: Array) -> tuple[Array, Array]:
+    """Find the point of the refined surface with given coordinates at rest, see `Rest`, shape (2,).
 
     Return the point [m] and the unit normal of the surface there, upward at rest, shape (3,) each. A point outside the
     sheet moves with the nearest point of the sheet's edge. `refine` vertices lie between neighbouring mass points.
     """
-    height, width = sheet.size
-    across = min(1.0, max(0.0, rest[0] / width + 0.5))
-    down = min(1.0, max(0.0, 0.5 - rest[1] / height))
-    point, normal = (values[0] for values in _interpolate(position, refine, np.array([[across, down]])))
-    outside = np.array([rest[0] - (across - 0.5) * width, rest[1] - (0.5 - down) * height, 0.0])
+    rest = rest_of(sheet)
+    inside = np.clip(rest.fractions(at), 0.0, 1.0)
+    point, normal = (values[0] for values in _interpolate(position, refine, inside[None]))
+    outside = rest.place(np.asarray(at)[None])[0] - rest.place(rest.coordinates(inside)[None])[0]
     return point + outside, normal / max(float(np.linalg.norm(normal)), 1e-300)
 
 
@@ -142,7 +141,7 @@ def place_instruments(scene: Scene, position: NDArray[np.floating], time: float)
 
 
 def place_instrument(instrument: Instrument, scene: Scene, position: NDArray[np.floating], rest: Array) -> Solid:
-    """Place the instrument of a force-controlled probe above the material point at rest at x and y [m].
+    """Place the instrument of a force-controlled probe above the material point with coordinates at rest, see `Rest`.
 
     Its tip is on the side of the deformed surface to which the shaft points.
     """

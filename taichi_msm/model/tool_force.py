@@ -8,7 +8,8 @@ A probe with `total` exerts a force F per area of a mass point, which is indepen
 
     F = total w(d) / W,    w = exp(-falloff max(d - R, 0)),    W = pi R^2 + 2 pi (R / falloff + 1 / falloff^2)
 
-where W is the integral of w over an infinite sheet and R the `radius` of the tool's flat end.
+where W is the integral of w over an infinite sheet and R the `radius` of the tool's flat end. A force that is a number
+is along the normal of the sheet at rest at the control point.
 """
 
 from __future__ import annotations
@@ -21,7 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 from typing_extensions import TypedDict
 
-from taichi_msm.model.sheet import spacing
+from taichi_msm.model.rest import CurvedRest, rest_of
 from taichi_msm.scene.scene import Scene
 from taichi_msm.scene.sheet import Sheet
 from taichi_msm.scene.tools import Probe
@@ -53,32 +54,37 @@ class ProbeForce(NamedTuple):
 
 def probe_force(probe: Probe, sheet: Sheet) -> ProbeForce:
     """Return the force law of a force-controlled probe; the area of the sheet's cells scales a `total`."""
-    rim = probe.falloff * probe.radius
+    rim, vector = probe.falloff * probe.radius, probe.vector
+    assert vector is not None
     if probe.total is None:
-        assert probe.force is not None
-        return ProbeForce(probe.force, probe.falloff, probe.offset - rim, probe.offset, by_area=False)
-    dx, dy = spacing(sheet)
-    fraction = dx * dy / _decay_integral(probe)
-    x, y, z = probe.total
+        return ProbeForce(vector, probe.falloff, probe.offset - rim, probe.offset, by_area=False)
+    fraction = rest_of(sheet).cell_area / _decay_integral(probe)
+    x, y, z = vector
     return ProbeForce((x * fraction, y * fraction, z * fraction), probe.falloff, 0.0 - rim, 0.0, by_area=True)
 
 
+def probe_directions(probe: Probe, sheet: Sheet, coordinates: Array) -> Array:
+    """Return `ProbeForce.force` [N] with the control point at coordinates, shape (n, 2); shape (n, 3)."""
+    force, rest = np.array(probe_force(probe, sheet).force), rest_of(sheet)
+    if not probe.is_normal or rest.is_flat:
+        return np.tile(force, (len(coordinates), 1))
+    return force[2] * rest.normals(coordinates)
+
+
 def control_points(probe: Probe, sheet: Sheet) -> tuple[Array, Array]:
-    """Return the keyframes of a control point: times [s], shape (n,), and x and y at rest [m], shape (n, 2)."""
+    """Return the keyframes of a control point: times [s], shape (n,), and coordinates of `Rest`, shape (n, 2)."""
     first = probe.at[0]
-    keys = probe.at if isinstance(first, tuple) else ((0.0, *probe.at),)
-    time, across, down = np.array(keys, dtype=float).T
-    height, width = sheet.size
-    return time, np.stack([(across - 0.5) * width, (0.5 - down) * height], axis=1)
+    keys = np.array(probe.at if isinstance(first, tuple) else ((0.0, *probe.at),), dtype=float)
+    return keys[:, 0], rest_of(sheet).coordinates(keys[:, 1:])
 
 
 def control_point(probe: Probe, sheet: Sheet, time: float) -> Array:
-    """Return a probe's control point, x and y at rest [m], shape (2,); at a jump, the point after the jump."""
+    """Return the coordinates of a probe's control point, shape (2,); at a jump, those after the jump."""
     return point_at(*control_points(probe, sheet), time)
 
 
 def point_at(times: Array, points: Array, time: float) -> Array:
-    """Interpolate between the control points of keyframes [m], shape (n, 2); at a jump, return the point after it."""
+    """Interpolate between the control points of keyframes, shape (n, 2); at a jump, return the point after it."""
     # A keyframe later than the time by a rounding error counts as reached.
     after = int(np.searchsorted(times, time + 1e-12 * max(1.0, abs(time)), side="right"))
     if after in (0, len(times)):
@@ -100,7 +106,16 @@ def sum_probe_forces(probe: Probe, sheet: Sheet, refinement: int = 1) -> tuple[f
     Return the sum [N], and the largest force on a mass point per area that belongs to it [Pa], for a sheet whose cells
     are divided along both axes by the factor `refinement`.
     """
-    law, (at_x, at_y) = probe_force(probe, sheet), control_points(probe, sheet)[1][0]
+    law, at, rest = probe_force(probe, sheet), control_points(probe, sheet)[1][0], rest_of(sheet)
+    force = math.hypot(*law.force)
+    if isinstance(rest, CurvedRest):
+        finer = sheet.model_copy(update={"points": tuple((count - 1) * refinement + 1 for count in sheet.points)})
+        fine = rest_of(finer)
+        assert isinstance(fine, CurvedRest)
+        decay, areas = law.decay(fine.distances(at)), fine.areas / rest.cell_area
+        forces = decay * areas if law.by_area else decay / refinement**2
+        return force * float(forces.sum()), force * float((forces / fine.areas).max())
+    at_x, at_y = at
     (rows, cols), (height, width) = ((count - 1) * refinement for count in sheet.points), sheet.size
     x, y = (np.arange(cols + 1) / cols - 0.5) * width, (0.5 - np.arange(rows + 1) / rows) * height
     along, down = np.ones(cols + 1), np.ones(rows + 1)
@@ -114,8 +129,7 @@ def sum_probe_forces(probe: Probe, sheet: Sheet, refinement: int = 1) -> tuple[f
         area_share = down[rows_of_block, None] * along
         total += float((decay * area_share if law.by_area else decay).sum())
         largest = max(largest, float((decay if law.by_area else decay / area_share).max()))
-    force, (dx, dy) = math.hypot(*law.force), spacing(sheet)
-    return force * total / refinement**2, force * largest / (dx * dy)
+    return force * total / refinement**2, force * largest / rest.cell_area
 
 
 class ProbeRecord(TypedDict, total=False):
@@ -139,8 +153,8 @@ def probe_records(scene: Scene) -> list[ProbeRecord]:
             records.append(ProbeRecord())
             continue
         flat, (total, pressure) = 0.0, sum_probe_forces(probe, scene.sheet)
-        if probe.total is not None:
-            flat = math.hypot(*probe.total) * math.pi * probe.radius * probe.radius / _decay_integral(probe)
+        if probe.total is not None and probe.vector is not None:
+            flat = math.hypot(*probe.vector) * math.pi * probe.radius * probe.radius / _decay_integral(probe)
         records.append(ProbeRecord(total_force=total, flat_end_force=flat, largest_pressure=pressure))
     return records
 
@@ -158,12 +172,13 @@ def describe_forces(record: ProbeRecord) -> str:
 
 def force_warnings(scene: Scene, records: Sequence[ProbeRecord]) -> Iterator[str]:
     """Yield warnings of probes whose forces on this sheet, from `probe_records`, do not add up to their `total`."""
-    across, down = spacing(scene.sheet)
+    across, down = rest_of(scene.sheet).cell_sides
     cell = f"a cell of {across:.3g} x {down:.3g} m"
     for index, (probe, record) in enumerate(zip(scene.probes, records, strict=True)):
         if probe.moved:
             continue
-        requested, applied = math.hypot(*probe.total) if probe.total is not None else 0.0, record["total_force"]
+        assert probe.vector is not None
+        requested, applied = math.hypot(*probe.vector) if probe.total is not None else 0.0, record["total_force"]
         if requested > 0 and applied <= MIN_FORCE_RATIO * requested:
             yield (
                 f"probes.{index}: {applied:.3g} N of its {requested:.3g} N reach the sheet; is the tool outside "

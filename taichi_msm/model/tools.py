@@ -1,7 +1,9 @@
 """Position-controlled tools, `probes` with `path` in a scene: shapes that touch the sheet, and clamps.
 
 A shape (`taichi_msm.shapes`) has the axis c(t) + s a with 0 <= s <= length, where c is its tip and a the unit vector
-along its shaft. It can grip the mass points at its tip.
+along its shaft. It can grip the mass points at its tip. Over a curved sheet the tool follows the surface at rest: with
+X the place (across, down) on it, N its normal there and h the height, which are linear between keyframes,
+c = X + (h + tip) N, where tip is the height of the shape's tip above its lowest point along N.
 
 A clamp holds a side of the sheet from the start and displaces all its mass points alike.
 """
@@ -11,7 +13,8 @@ from __future__ import annotations
 import math
 from abc import ABC, abstractmethod
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import cached_property
 from itertools import combinations
 
 import numpy as np
@@ -19,7 +22,8 @@ from numpy.typing import NDArray
 
 from taichi_msm.arithmetic import NUMPY
 from taichi_msm.errors import Problem
-from taichi_msm.model.sheet import SIDES, fixed_points, fixed_sides, rest_positions, spacing
+from taichi_msm.model.rest import Rest, rest_of
+from taichi_msm.model.sheet import SIDES, fixed_points, fixed_sides, rest_positions
 from taichi_msm.model.time_grid import TimeGrid
 from taichi_msm.scene.scene import Scene
 from taichi_msm.scene.section import FRAME_TOLERANCE, Side
@@ -63,7 +67,7 @@ class Tool(ABC):
     @property
     def path_length(self) -> float:
         """Length of the whole path [m]."""
-        return float(np.linalg.norm(np.diff(self.path, axis=0), axis=1).sum())
+        return float(np.linalg.norm(np.diff(self.path_at(self.bends), axis=0), axis=1).sum())
 
     @property
     def reach(self) -> float:
@@ -72,7 +76,12 @@ class Tool(ABC):
 
     def path_at(self, t: Array) -> Array:
         """Return the path at times t [m], shape (n, 3), constant before its first and after its last keyframe."""
-        return np.stack([np.interp(t, self.times, self.path[:, axis]) for axis in range(3)], axis=-1)
+        return _interpolate(t, self.times, self.path)
+
+    @property
+    def bends(self) -> Array:
+        """Times between which the path is straight, or on a curved sheet smooth [s]."""
+        return self.times
 
     def max_stride(self, step: float, first: int = 0) -> tuple[float, int]:
         """Return the largest displacement in a step [m], and the index of the keyframe after it.
@@ -80,7 +89,8 @@ class Tool(ABC):
         The path before keyframe `first` is ignored. As a function of the step's begin, the displacement is convex
         between the times at which a keyframe enters or leaves the step. Its maximum is therefore at one of these times.
         """
-        begin = np.maximum([0.0, *self.times, *(self.times - step)], max(0.0, self.times[first] if first else 0.0))
+        bends = self.bends
+        begin = np.maximum([0.0, *bends, *(bends - step)], max(0.0, self.times[first] if first else 0.0))
         strides = np.linalg.norm(self.path_at(begin + step) - self.path_at(begin), axis=1)
         longest = int(strides.argmax())
         key = min(int(self.times.searchsorted(begin[longest], "right")), len(self.times) - 1)
@@ -137,6 +147,10 @@ class SolidTool(Tool):
         x, y, z = (float(np.interp(t, self.times, each)) for each in (*self.path.T[:2], self.heights))
         return x, y, z
 
+    def direction_at(self, t: float) -> Array:  # noqa: ARG002
+        """Return the unit vector at a time [s] along which the height of the tip is measured, shape (3,)."""
+        return np.array([0.0, 0.0, 1.0])
+
     def touches(self, positions: Array, t: float) -> bool:
         """Return whether any position [m], shape (n, 3), is in the shape or, up to rounding, on it at a time [s]."""
         r = positions - self.path_at(np.array([t]))[0]
@@ -145,6 +159,10 @@ class SolidTool(Tool):
 
     def gap(self, sheet: Sheet, t: float = 0.0) -> float:
         """Return the distance at a time [s] from the sheet at rest [m], negative inside the sheet."""
+        if sheet.surface:
+            r = rest_of(sheet).position.reshape(-1, 3) - self.path_at(np.array([t]))[0]
+            depth, *_ = self.shape.build_depth(NUMPY)(*r.T, *self.axis, self.length, self.radius)
+            return -float(depth.max())
         half = np.array([sheet.size[1] / 2, sheet.size[0] / 2, 0.0])
         return self.shape.gap(self.path_at(np.array([t]))[0], self.axis, self.length, self.radius, half)
 
@@ -157,7 +175,7 @@ class SolidTool(Tool):
         key, depth = ("probes", self.probe, "path"), -self.gap(scene.sheet)
         if depth > 1e-9 * self.radius:
             remedy = "begin above it, at a greater height"
-            if self.axis[2] < 0:
+            if self.axis @ self.direction_at(0.0) < 0:
                 remedy = "its shaft points down; take the direction from the tip to the handle"
             yield Problem(key, f"the instrument is {depth:.3g} m in the sheet at rest at 0 s; {remedy}")
         if problem := self.friction_problem(at_rest=scene.time.at_rest):
@@ -188,12 +206,58 @@ class SolidTool(Tool):
         )
 
     def warnings(self, scene: Scene) -> Iterator[str]:
-        height_max, side = float(np.abs(self.heights).max()), max(scene.sheet.size)
+        height_max, side = float(np.abs(self.heights).max()), rest_of(scene.sheet).extent
         if height_max > side:
             yield (
                 f"probes.{self.probe}.path: a height of {height_max:g} m, and the sheet is {side:g} m long; "
                 "heights are in metres"
             )
+
+
+@dataclass(frozen=True, eq=False)
+class FollowingTool(SolidTool):
+    """A tool over a curved sheet, whose path follows the surface at rest."""
+
+    rest: Rest
+    places: Array  # across and down at the keyframes, shape (n, 2)
+
+    def path_at(self, t: Array) -> Array:
+        points, normals, heights = self._follow(t)
+        # `tip_height` of each shape depends on the angle between its axis and N only.
+        tips = [tip_offset(self.shape, self.axis, self.radius, normal) for normal in normals]
+        return points + (heights + tips)[:, None] * normals
+
+    @cached_property
+    def bends(self) -> Array:
+        # The path is smooth between the edges of cells, and there nearly straight.
+        cells = np.abs(np.diff(self.places, axis=0)) @ np.array(self.rest.position.shape[1::-1])
+        parts = zip(self.times, self.times[1:], cells, strict=False)
+        return np.unique(np.concatenate([self.times, *(np.linspace(a, b, 2 + 8 * int(n)) for a, b, n in parts)]))
+
+    def lowest_point(self, t: float) -> tuple[float, float, float]:
+        points, normals, heights = self._follow(np.array([t]))
+        x, y, z = (points[0] + heights[0] * normals[0]).tolist()
+        return x, y, z
+
+    def direction_at(self, t: float) -> Array:
+        return self._follow(np.array([t]))[1][0]
+
+    def _follow(self, t: Array) -> tuple[Array, Array, Array]:
+        """Return X [m] and N, shape (n, 3) each, and the height [m], shape (n,)."""
+        places = _interpolate(t, self.times, self.places)
+        return self.rest.place(places), self.rest.normals(places), np.interp(t, self.times, self.heights)
+
+
+def tip_offset(shape: Shape, axis: Array, radius: float, normal: Array) -> float:
+    """Return the height of a shape's tip above its lowest point along a normal [m]."""
+    # The shape's formula is for the normal z: an axis at the same angle from it.
+    along = float(axis @ normal)
+    return shape.tip_height(np.array([float(np.linalg.norm(axis - along * normal)), 0.0, along]), radius)
+
+
+def _interpolate(t: Array, times: Array, values: Array) -> Array:
+    """Interpolate values at keyframes, shape (n, k), at times [s], shape (m,); shape (m, k)."""
+    return np.stack([np.interp(t, times, column) for column in values.T], axis=-1)
 
 
 @dataclass(frozen=True, eq=False)
@@ -220,7 +284,7 @@ class Clamp(Tool):
             yield Problem((*key, "path", 0), text)
 
     def warnings(self, scene: Scene) -> Iterator[str]:
-        distance, side = float(np.linalg.norm(self.path, axis=1).max()), max(scene.sheet.size)
+        distance, side = float(np.linalg.norm(self.path, axis=1).max()), rest_of(scene.sheet).extent
         if distance > side:
             yield (
                 f"probes.{self.probe}.path: a displacement of {distance:g} m, and the sheet is {side:g} m long; "
@@ -240,7 +304,7 @@ def clamps(tools: Sequence[Tool]) -> dict[int, Clamp]:
 
 def build_tools(probes: Sequence[Probe], sheet: Sheet) -> tuple[Tool, ...]:
     """Return the position-controlled tools of a scene, in the order of the probes, of which the others are skipped."""
-    height, width = sheet.size
+    rest = rest_of(sheet)
     tools: list[Tool] = []
     clamped: list[Side] = []
     for index, probe in enumerate(probes):
@@ -251,14 +315,19 @@ def build_tools(probes: Sequence[Probe], sheet: Sheet) -> tuple[Tool, ...]:
             clamped.append(probe.clamp)
             continue
         assert probe.instrument is not None
-        instrument, (time, across, down, heights) = probe.instrument, np.array(probe.path, dtype=float).T
+        instrument, keys = probe.instrument, np.array(probe.path, dtype=float)
+        time, places, heights = keys[:, 0], keys[:, 1:3], keys[:, 3]
         shape, axis, radius = SHAPES[instrument.shape], unit_vector(instrument.shaft), instrument.outer_radius
-        tips = heights + shape.tip_height(axis, radius)
-        path = np.stack([(across - 0.5) * width, (0.5 - down) * height, tips], axis=1)
+        path = rest.place(rest.coordinates(places))
+        path[:, 2] += heights + shape.tip_height(axis, radius)
         friction = math.inf if probe.friction == "rough" else probe.friction
         stride = min(shape.max_stride, ROUGH_STRIDE_RADII if friction == math.inf else 1) * radius
-        solid = axis, instrument.length, radius, shape
-        tools.append(SolidTool(index, time, path, stride, probe.grip, heights, *solid, friction))
+        numbers = index, time, path, stride, probe.grip, heights, axis, instrument.length, radius, shape, friction
+        if rest.is_flat:
+            tools.append(SolidTool(*numbers))
+        else:
+            following = FollowingTool(*numbers, rest, places)
+            tools.append(replace(following, path=following.path_at(time)))
     return tuple(tools)
 
 
@@ -271,7 +340,7 @@ def _build_clamp(probe: int, side: Side, path: Array, sheet: Sheet, earlier: Seq
     points &= ~fixed_points(sheet)
     rest_tip = rest_positions(sheet)[points].sum(axis=0) / max(1, points.sum())
     # Half the length of the shortest spring at rest.
-    return Clamp(probe, path[:, 0], path[:, 1:], 0.5 * min(spacing(sheet)), (), side, points, rest_tip)
+    return Clamp(probe, path[:, 0], path[:, 1:], 0.5 * rest_of(sheet).shortest_side, (), side, points, rest_tip)
 
 
 def unit_vector(shaft: Sequence[float]) -> Array:
@@ -307,7 +376,8 @@ def min_steps_per_frame(tools: Sequence[Tool], grid: TimeGrid, min_steps: int) -
 
 def path_warnings(scene: Scene, tools: Sequence[Tool]) -> Iterator[str]:
     """Yield warnings of implausible paths and grips, of tools too thin for the mesh, and of tools that intersect."""
-    spacing_max, end, solids = max(spacing(scene.sheet)), scene.time.duration, solid_tools(tools)
+    rest, end, solids = rest_of(scene.sheet), scene.time.duration, solid_tools(tools)
+    spacing_max = rest.longest_side
     for n, tool in enumerate(tools):
         yield from tool.warnings(scene)
         if tool.times[-1] > end * (1 + 1e-9):
@@ -318,7 +388,9 @@ def path_warnings(scene: Scene, tools: Sequence[Tool]) -> Iterator[str]:
             elif scene.time.at_rest and not grip_frames((begin, until), scene.time.frames_per_second):
                 yield f"probes.{tool.probe}.grip from {begin:g} to {until:g} s holds nothing: no frame is between them"
         if n in solids and spacing_max > MAX_SPACING_RADII * (radius := solids[n].radius):
-            points = [int(np.ceil(length / (MAX_SPACING_RADII * radius))) + 1 for length in scene.sheet.size]
+            least = MAX_SPACING_RADII * radius
+            lengths = scene.sheet.size if rest.is_flat else [(n - 1) * spacing_max for n in scene.sheet.points]
+            points = [int(np.ceil(length / least)) + 1 for length in lengths]
             affordable = math.prod(points) <= MAX_POINTS_RATIO * math.prod(scene.sheet.points)
             remedy = f"try sheet.points: {points}" if affordable else "take a wider tip"
             yield (

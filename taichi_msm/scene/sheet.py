@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection
-from typing import Annotated, Literal
+import math
+from collections.abc import Collection, Mapping
+from typing import Annotated, Any, Literal
 
-from pydantic import Field, model_validator
+import numpy as np
+from pydantic import Field, ValidationError, model_validator
 from typing_extensions import Self
 
+from taichi_msm.images import PictureError
 from taichi_msm.laws.locking import Locking
 from taichi_msm.scene.section import (
     MAX_POINTS,
@@ -25,16 +28,25 @@ from taichi_msm.scene.section import (
     key,
     scene_fault,
 )
+from taichi_msm.scene.surface import PointGrid, Surface
 
 
 class Sheet(Section):
     """Sheet of mass points."""
 
     points: tuple[NodeCount, NodeCount] = key(
-        ..., "rows, columns of mass points", f"two whole numbers, 2 to {MAX_POINTS}: [rows, cols]"
+        ...,
+        "rows, columns of mass points; with surface.points by default those of its file",
+        f"two whole numbers, 2 to {MAX_POINTS}: [rows, cols]",
     )
     size: tuple[Positive, Positive] = key(
-        ..., "height, width of the sheet at rest [m]", "two numbers above 0: [height, width] in metres"
+        ...,
+        "height, width of the sheet at rest, with a surface of the flat sheet that is bent [m]; not with "
+        "surface.points, which has its own",
+        "two numbers above 0: [height, width] in metres",
+    )
+    surface: Surface | None = key(
+        None, "the sheet at rest, where it is not flat", "a mapping with one of height, tube, dome, points"
     )
     mass: Positive | None = key(
         None,
@@ -51,6 +63,46 @@ class Sheet(Section):
         f"a number, {MIN_TOLERANCE:g} to {MAX_TOLERANCE:g}",
     )
 
+    @model_validator(mode="before")
+    @classmethod
+    def _measure_point_grid(cls, data: Any) -> Any:
+        """Add the size, and unless it is given the number of points, of the file of `surface.points`."""
+        surface = data.get("surface") if isinstance(data, Mapping) else None
+        grid = surface.get("points") if isinstance(surface, Mapping) else getattr(surface, "points", None)
+        if grid is None:
+            return data
+        if "size" in data:
+            raise scene_fault("conflicts with surface.points, whose size is that of its points; remove size", "size")
+        try:
+            positions = (grid if isinstance(grid, PointGrid) else PointGrid.model_validate(grid)).points.values
+        except PictureError as error:
+            raise scene_fault(str(error), "surface", "points", "file") from None
+        except ValidationError:
+            # The faults of the section come alone.
+            return {"points": (2, 2), **data, "size": (1.0, 1.0)}
+        width, height = np.maximum(np.ptp(positions[..., :2], axis=(0, 1)), 1e-30).tolist()
+        return {"points": positions.shape[:2], **data, "size": (height, width)}
+
+    @model_validator(mode="after")
+    def _check_surface(self) -> Self:
+        surface, (height, width) = self.surface, self.size
+        if surface is None:
+            return self
+        if surface.points:
+            # A copy measures the points again.
+            self.__pydantic_fields_set__.discard("size")
+        if surface.tube and width > 2 * math.pi * abs(surface.tube.radius):
+            text = f"{surface.tube.radius:g} m is too small to roll {width:g} m; take {_radius(width / 2 / math.pi)}"
+            raise scene_fault(text, "surface", "tube", "radius")
+        if surface.dome and max(height, width) / 2 > math.pi / 4 * abs(surface.dome.radius):
+            text = f"{surface.dome.radius:g} m is too small for a side of {max(height, width):g} m"
+            remedy = f"take {_radius(2 * max(height, width) / math.pi)}, or a smaller sheet.size"
+            raise scene_fault(f"{text}; {remedy}", "surface", "dome", "radius")
+        return self
+
+    def _unused_keys(self) -> Collection[str]:
+        return ("size",) if self.surface and self.surface.points else () if self.surface else ("surface",)
+
     @property
     def unit_hint(self) -> str:
         """Warning about a size that is probably in millimetres; empty for a sheet of up to 5 m."""
@@ -59,6 +111,10 @@ class Sheet(Section):
             return ""
         remedy = f"if these are millimetres, take [{height / 1000:g}, {width / 1000:g}]"
         return f"sheet.size: {height:g} x {width:g} m is large for tissue; {remedy}"
+
+
+def _radius(least: float) -> str:
+    return f"at least {least:.4g} m, or at most {-least:.4g} m"
 
 
 class StiffnessMap(Section):

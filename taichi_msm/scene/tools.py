@@ -114,13 +114,16 @@ class Probe(Section):
         "keyframes [[t, across, down], ...], linear between, constant outside",
         "[across, down], fractions from -1 to 2, or keyframes [[t, across, down], ...]",
     )
-    total: Vector | None = key(
-        None, "total force of the tool on a wide sheet at 100 % [N]", "three numbers: [x, y, z] in newtons"
+    total: Vector | Number | None = key(
+        None,
+        "total force of the tool on a wide sheet at 100 % [N]; a number is along the normal of the sheet at rest at "
+        "the control point",
+        "three numbers, [x, y, z] in newtons, or a number",
     )
-    force: Vector | None = key(
+    force: Vector | Number | None = key(
         None,
         "with springs, instead of total: force on a mass point at 100 %, before decay and offset [N]",
-        "three numbers: [x, y, z] in newtons",
+        "three numbers, [x, y, z] in newtons, or a number",
     )
     load: Annotated[tuple[tuple[Number, Number], ...], Field(min_length=1)] = key(
         ((0.0, 100.0),),
@@ -163,9 +166,28 @@ class Probe(Section):
         """Whether the tool is position-controlled, by a path, rather than force-controlled."""
         return self.path is not None
 
+    @property
+    def vector(self) -> Vector | None:
+        """Force or total as x, y and z [N], a number along z; None with a path."""
+        force = self.force if self.total is None else self.total
+        return force if force is None or isinstance(force, tuple) else (0.0, 0.0, force)
+
+    @property
+    def is_normal(self) -> bool:
+        """Whether the force is a number, along the normal of the sheet at rest."""
+        return isinstance(self.total if self.force is None else self.force, float)
+
+    def with_force(self, factor: float) -> Probe:
+        """Return a copy with a multiple of its total."""
+        total = self.total
+        if total is None:
+            return self
+        scaled = tuple(factor * part for part in total) if isinstance(total, tuple) else factor * total
+        return self.model_copy(update={"total": scaled})
+
     @field_validator("force", mode="after")
     @classmethod
-    def _check_one_force(cls, force: Vector | None, info: ValidationInfo) -> Vector | None:
+    def _check_one_force(cls, force: Vector | float | None, info: ValidationInfo) -> Vector | float | None:
         if not {"clamp", "path", "total"} <= info.data.keys():
             return force  # A fault of these keys is reported separately.
         total = info.data["total"]

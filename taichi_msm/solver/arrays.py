@@ -67,15 +67,17 @@ class InitialData(NamedTuple):
     state: State | None  # state to continue from; None for the sheet at rest
 
 
-def to_lanes(layout: SheetLayout, values: NDArray[Any]) -> NDArray[Any]:
+def to_lanes(layout: SheetLayout, values: NDArray[Any], *, continued: bool = False) -> NDArray[Any]:
     """Arrange values by column, shape (..., cols), in lanes with halo, in the precision of the kernels.
 
-    The result has the shape (entries, lanes), with `layout.width` entries per row, and 0 in entries without a column.
-    Values too large for the precision become infinite.
+    The result has the shape (entries, lanes), with `layout.width` entries per row, and in entries without a column 0,
+    or if `continued` the value of the last column. Values too large for the precision become infinite.
     """
     column = np.arange(layout.config.lanes) * layout.strip + np.arange(-1, layout.strip + 1)[:, None]
     inside = (column >= 0) & (column < layout.cols)
     dtype = DTYPES[layout.config.precision]
+    if continued:
+        column, inside = np.clip(column, 0, layout.cols - 1), np.ones_like(inside)
     with np.errstate(over="ignore"):
         entries = np.take(values.astype(dtype), column * inside, axis=-1) * inside.astype(dtype)
     return entries.reshape(-1, layout.config.lanes)
@@ -112,7 +114,12 @@ class SheetArrays:
             self.set_displacement(start.state.displacement)
             for c in range(3):
                 self._set(self.d[c], start.state.difference[..., c])
-        self._set(self.fields, start.fields)
+        entries, rest = to_lanes(layout, start.fields), layout.config.point_fields.rest
+        # Entries without a mass point must not extend the box of a row.
+        at = rest.start * layout.rows * layout.width
+        continued = to_lanes(layout, start.fields[rest.start : rest.stop], continued=True)
+        entries[at : at + len(continued)] = continued
+        write_vectors(self.fields, entries)
 
     @property
     def all(self) -> tuple[Any, ...]:

@@ -17,7 +17,7 @@ from taichi_msm.model.plan import Plan
 from taichi_msm.model.sheet import rest_positions
 from taichi_msm.model.surface import surface_point
 from taichi_msm.model.time_grid import DTYPES
-from taichi_msm.model.tool_force import probe_force
+from taichi_msm.model.tool_force import probe_directions
 from taichi_msm.solver.arrays import InitialData, SheetLayout, StepKernel
 from taichi_msm.solver.contact_corrections import sum_corrections
 from taichi_msm.solver.kernel_cpu import ScatterKernel
@@ -163,7 +163,7 @@ class ForceRecorder:
                 continue
             percent, at = self._loads[index].at(frame, rate)
             factor = percent / 100 * self._decay_sum(index, at) if percent else 0.0
-            x, y, z = probe_force(probe, sheet).force
+            x, y, z = probe_directions(probe, sheet, at[None])[0].tolist()
             tip, _ = surface_point(position, plan.scene.render.refine, sheet, at)
             # Adding 0 turns -0 into 0.
             forces.append(TipForce(index, tuple(tip.tolist()), (factor * x + 0.0, factor * y + 0.0, factor * z + 0.0)))

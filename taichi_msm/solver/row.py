@@ -15,6 +15,7 @@ from collections.abc import Callable
 
 from taichi_msm.system.runtime import ti
 from taichi_msm.terms.base import BY_COLUMN, DX, DY, Correction, Entry, KernelConfig, RowPair, build_max_lane
+from taichi_msm.terms.points import build_point_functions
 from taichi_msm.terms.springs import SpringTerm
 
 
@@ -120,17 +121,25 @@ def build_pass_row(config: KernelConfig, move: Callable[..., None]) -> Callable[
 def build_correct_row(config: KernelConfig, correction: Correction) -> Callable[..., None]:
     """Build the Taichi function correct_row(sheet, i, kind, loads, n), which corrects row i, if a term may need it."""
     columns, (reaches, resolve), max_lane = config.columns().end, correction, build_max_lane(config)
+    curved, rest_position = config.curved, build_point_functions(config).rest_position
+
+    @ti.func
+    def place(sheet: ti.template(), i, b):
+        """Return displacements along y and z, on a curved sheet positions."""
+        placed = [sheet.u[c][i * sheet.width + b] for c in ti.static((1, 2))]
+        if ti.static(curved):
+            rest = rest_position(sheet, i, b)
+            placed[0], placed[1] = placed[0] + rest[1], placed[1] + rest[2]
+        return placed
 
     @ti.func
     def correct_row(sheet: ti.template(), i, kind, loads: ti.template(), n):
         now = [loads[n, c] for c in ti.static(range(columns))]
-        at = i * sheet.width
-        # Smallest and largest displacements along y and z.
-        least, most = [[sheet.u[c][at + 1] for c in ti.static((1, 2))] for _ in ti.static(range(2))]
+        least, most = place(sheet, i, 1), place(sheet, i, 1)
         for b in range(2, sheet.width - 1):
+            placed = place(sheet, i, b)
             for axis in ti.static(range(2)):
-                value = sheet.u[axis + 1][at + b]
-                least[axis], most[axis] = ti.min(least[axis], value), ti.max(most[axis], value)
+                least[axis], most[axis] = ti.min(least[axis], placed[axis]), ti.max(most[axis], placed[axis])
         low = [0 - max_lane(0.0 - least[axis]) for axis in ti.static(range(2))]
         high = [max_lane(most[axis]) for axis in ti.static(range(2))]
         if reaches(sheet, i, low, high, now):

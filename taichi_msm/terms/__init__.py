@@ -6,13 +6,15 @@ docs/architecture.md describes how to add a term.
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from taichi_msm.model.plan import Plan
-from taichi_msm.model.sheet import Maps, Material, cell_factors, point_areas, point_factors, spacing
+from taichi_msm.model.rest import CurvedRest, rest_of
+from taichi_msm.model.sheet import Maps, Material, cell_factors, point_areas, point_factors
 from taichi_msm.scene.scene import Scene
 from taichi_msm.scene.sheet import Sheet
 from taichi_msm.terms.base import Term
@@ -21,7 +23,7 @@ from taichi_msm.terms.contact import ContactTerm
 from taichi_msm.terms.damping import DampingTerm
 from taichi_msm.terms.foundation import FoundationTerm
 from taichi_msm.terms.loads import ProbeTerm
-from taichi_msm.terms.springs import SpringTerm
+from taichi_msm.terms.springs import SpringTerm, curved_springs
 from taichi_msm.terms.viscoelasticity import ViscoelasticTerm
 
 # All terms, in the order of summation, on which the last bits of results depend.
@@ -41,22 +43,27 @@ def derive_material(scene: Scene, maps: Maps) -> Material:
 
     The scene has no `material_key_problems`.
     """
-    (dx, dy), mass = spacing(scene.sheet), scene.sheet.mass
+    rest, mass = rest_of(scene.sheet), scene.sheet.mass
     samplers = {"map": cell_factors, "foundation_map": point_factors}
     factors = {key: samplers[key](scene.maps[key], maps[key], scene.sheet) for key in scene.maps.keys() & maps.keys()}
     if scene.tissue is not None:
-        mass = (scene.tissue.density or 0.0) * scene.tissue.thickness * (dx * dy)
+        mass = (scene.tissue.density or 0.0) * scene.tissue.thickness * rest.cell_area
     if scene.time.at_rest:
         mass = 1.0  # Static equilibrium does not depend on it.
     assert mass is not None
     derived: dict[str, Any] = {name: value for term in TERMS for name, value in term.derive(scene).items()}
-    return Material(
+    material = Material(
         mass=mass,
         by_area=scene.tissue is not None,
         factors=factors.get("map"),
         virtual_factors=factors.get("foundation_map"),
         **derived,
     )
+    if not isinstance(rest, CurvedRest):
+        return material
+    membrane = scene.tissue.young * scene.tissue.thickness if scene.tissue else 0.0
+    springs = curved_springs(material, scene.sheet, rest, membrane)
+    return replace(material, springs=springs, shares=rest.areas / rest.cell_area)
 
 
 def build_terms(plan: Plan) -> tuple[Term, ...]:

@@ -188,7 +188,7 @@ class Correction(NamedTuple):
 
     Attributes:
         reaches: reaches(sheet, i, low, high, now) returns whether row i may need a correction; `low` and `high` bound
-            its displacements along y and z, two numbers each.
+            its displacements along y and z, on a curved sheet its positions, two numbers each.
         resolve: resolve(sheet, i, kind, at, b, now) corrects entry b of row i, row `at` of u.
     """
 

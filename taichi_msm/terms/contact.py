@@ -181,7 +181,7 @@ class ContactTerm(Term):
     def _build_reaches(self, config: KernelConfig) -> Callable[..., Any]:
         ti, real, vector, grips = config.ti, config.real, config.vector, self.grips
         max_lane, columns, fields = build_max_lane(config), config.columns(ContactTerm), config.fields(ContactTerm)
-        solids = [columns.tools[n] for n in self._solids]
+        solids, curved = [columns.tools[n] for n in self._solids], config.curved
 
         @ti.func
         def cut(low, high, begin, end, start, inverse):
@@ -191,7 +191,9 @@ class ContactTerm(Term):
 
         @ti.func
         def reaches(sheet: ti.template(), i, low: ti.template(), high: ti.template(), now: ti.template()):
-            y, reached = sheet.constants[TOP_Y] - i * sheet.constants[DY], False
+            y, reached = ti.cast(0, real), False
+            if ti.static(not curved):
+                y = sheet.constants[TOP_Y] - i * sheet.constants[DY]
             for tool in ti.static(solids):
                 # Slightly more than the radius, because of rounding.
                 reach = 1.001 * now[tool.radius]

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from taichi_msm.arithmetic import NUMPY
 from taichi_msm.model.plan import Plan
-from taichi_msm.model.sheet import rest_positions, spacing
+from taichi_msm.model.rest import rest_of
 from taichi_msm.terms.law import SpringFunctions, build_spring
 from taichi_msm.terms.springs import Window, assemble_springs, spring_ends
 
@@ -72,9 +72,9 @@ class SpringFamily(NamedTuple):
 def spring_families(plan: Plan) -> Iterator[SpringFamily]:
     """Build the families of springs along rows, along columns and along both diagonals."""
     material, sheet = plan.material, plan.scene.sheet
-    springs, law = assemble_springs(material, sheet.points), material.stiffening
+    springs, law = assemble_springs(material, sheet), material.stiffening
     functions = build_spring(law.law if law else None, NUMPY)
-    rest = rest_positions(sheet) if springs.rest is None else springs.rest
+    rest = rest_of(sheet).position if springs.rest is None else springs.rest
     for k, tension, (start, end) in zip(springs.stiffness, springs.tension, spring_ends(sheet.points), strict=True):
         offset = rest[end] - rest[start]
         length = np.sqrt((offset**2).sum(axis=-1))
@@ -89,9 +89,9 @@ def energy_density(plan: Plan, displacement: Array) -> Array:
     therefore the energy of all springs, relative to the state at rest. The displacement x - X [m] has the shape (rows,
     cols, 3).
     """
-    by_point, (dx, dy) = np.zeros(displacement.shape[:2]), spacing(plan.scene.sheet)
+    by_point, cell_area = np.zeros(displacement.shape[:2]), rest_of(plan.scene.sheet).cell_area
     for family in spring_families(plan):
         energy = family.energy(displacement)
         by_point[family.start] += energy / 2
         by_point[family.end] += energy / 2
-    return by_point / (dx * dy * plan.area_shares)
+    return by_point / (cell_area * plan.area_shares)

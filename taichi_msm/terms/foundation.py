@@ -1,13 +1,13 @@
 """The elastic (Winkler) foundation, or virtual springs: the force -K u pulls each mass point to its rest position.
 
-A foundation that locks resists the depth w = -u_z > 0 by K f(w) instead of K w, see `terms.law`.
+A foundation that locks resists the depth w = -u . N > 0, along the normal N at rest, by K f(w) instead of K w, see
+`terms.law`. On a flat sheet w = -u_z.
 
 Scene: `springs.virtual` and `virtual_active`, or `tissue.foundation`, `foundation_active` and `foundation_map`.
 """
 
 # No `from __future__ import annotations` here: Taichi reads the annotations of a kernel.
 
-import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any, ClassVar, NamedTuple
@@ -21,7 +21,8 @@ from taichi_msm.laws import law_of
 from taichi_msm.laws.law import Law, LawNumbers
 from taichi_msm.model.loads import Schedule
 from taichi_msm.model.plan import Plan
-from taichi_msm.model.sheet import Material, spacing
+from taichi_msm.model.rest import rest_normals, rest_of
+from taichi_msm.model.sheet import Material
 from taichi_msm.scene.scene import Scene
 from taichi_msm.scene.sheet import Sheet
 from taichi_msm.terms.base import KernelConfig, Term
@@ -41,13 +42,14 @@ class FoundationTerm(Term):
     by_area: bool  # whether K is smaller at an open edge, because mass points have less area there
     mapped: bool  # whether the factor of K at each mass point is read from a field
     law: Law | None = None  # when it is pressed in; None if it is linear
+    curved: bool = False  # whether the normals are fields, which a law needs
 
     @staticmethod
     def derive(scene: Scene) -> dict[str, Any]:
         """Derive K [N/m], 0 if the foundation is never active; whether it is always active; and its law."""
         stiffening: LawNumbers | None = None
         if scene.tissue is not None:
-            k = scene.tissue.foundation_stiffness * math.prod(spacing(scene.sheet))
+            k = scene.tissue.foundation_stiffness * rest_of(scene.sheet).cell_area
             active, stiffening = scene.tissue.foundation_active, law_of(scene.tissue.foundation)
         else:
             assert scene.springs is not None
@@ -62,8 +64,9 @@ class FoundationTerm(Term):
         mapped = material.virtual_factors is not None
         if material.virtual == 0:
             return None
-        by_area = plan.areas_vary and material.by_area and not mapped
-        return cls(by_area, mapped, material.virtual_stiffening.law if material.virtual_stiffening else None)
+        by_area, stiffening = plan.areas_vary and material.by_area and not mapped, material.virtual_stiffening
+        curved = stiffening is not None and plan.scene.sheet.surface is not None
+        return cls(by_area, mapped, stiffening.law if stiffening else None, curved)
 
     @staticmethod
     def stiffness_bound(material: Material, sheet: Sheet) -> float:
@@ -84,10 +87,15 @@ class FoundationTerm(Term):
 
     @property
     def field_places(self) -> Places:
-        return Places(factor=int(self.mapped))
+        return Places(factor=int(self.mapped), normal=3 * self.curved)
 
     def fields(self, plan: Plan) -> NDArray[Any]:
-        return point_shares(plan)[None] if self.mapped else super().fields(plan)
+        fields = super().fields(plan)
+        if self.mapped:
+            fields[self.field_places.factor] = point_shares(plan)
+        if self.curved:
+            fields[self.field_places.normal.start :] = np.moveaxis(rest_normals(plan.scene.sheet), -1, 0)
+        return fields
 
     @property
     def constant_places(self) -> Places:
@@ -104,8 +112,10 @@ class FoundationTerm(Term):
         return (self._build_add(config, tangent=True),)
 
     def _build_add(self, config: KernelConfig, *, tangent: bool) -> Callable[..., Any]:
-        ti, has_law, columns = config.ti, self.law is not None, config.columns(FoundationTerm)
+        ti, vector, columns = config.ti, config.vector, config.columns(FoundationTerm)
+        has_law = self.law is not None
         stiffness_at, (secant, slope, _) = self.build_stiffness(config), self._build_law(config)
+        curved, normals = self.curved, config.fields(FoundationTerm).normal
 
         @ti.func
         def add(force: ti.template(), sheet: ti.template(), entry: ti.template(), now: ti.template()):
@@ -113,7 +123,18 @@ class FoundationTerm(Term):
                 stiffness_at(sheet, entry, now[columns.stiffness]),
                 ti.static(entry.displacement if tangent else entry.u),
             )
-            for c in ti.static(range(3)):
+            if ti.static(curved):
+                at = entry.row.i * sheet.width + entry.b
+                n = [sheet.fields[normals[c] * sheet.rows * sheet.width + at] for c in ti.static(range(3))]
+                along, moved = vector(0), vector(0)
+                for c in ti.static(range(3)):
+                    along += u[c] * n[c]
+                    moved += entry.u[c] * n[c]
+                # The law replaces the linear part along the normal.
+                ratio = slope(sheet, along) if ti.static(tangent) else secant(sheet, along)
+                for c in ti.static(range(3)):
+                    force[c] = force[c] - k * (entry.u[c] + (ratio - 1) * moved * n[c])
+            for c in ti.static(range(0 if curved else 3)):
                 if ti.static(has_law and c == 2 and tangent):
                     force[c] = force[c] - k * (entry.u[c] * slope(sheet, u[2]))
                 elif ti.static(has_law and c == 2):
@@ -211,13 +232,14 @@ def foundation_force(material: Material, k: Array, displacement: Array) -> Found
     return FoundationForce(force, tangent, by_numbers)
 
 
-def foundation_energy(material: Material, k: Array | float, displacement: Array) -> float:
+def foundation_energy(plan: Plan, k: Array | float, displacement: Array) -> float:
     """Return the energy of a foundation of the stiffness k [N/m], a number or shape (rows, cols) [J]."""
-    square, law = displacement**2, material.virtual_stiffening
+    square, law = (displacement**2).sum(axis=-1), plan.material.virtual_stiffening
     if law is not None:
+        along = (displacement * rest_normals(plan.scene.sheet)).sum(axis=-1)
         scale, depth, *shape = law.constants(1.0)
-        square[..., 2] = depth**2 * law.law.build(NUMPY).integral(-displacement[..., 2] * scale, *shape)
-    return float((k * square.sum(axis=-1)).sum()) / 2
+        square += depth**2 * law.law.build(NUMPY).integral(-along * scale, *shape) - along**2
+    return float((k * square).sum()) / 2
 
 
 def point_shares(plan: Plan) -> NDArray[Any]:

@@ -18,14 +18,12 @@ from typing_extensions import Self
 
 from taichi_msm.model.loads import Schedule, decay, decay_gradient
 from taichi_msm.model.plan import Plan, ProbeSlot
+from taichi_msm.model.rest import rest_of
 from taichi_msm.model.sheet import axes, spacing
 from taichi_msm.model.tool_force import probe_force
 from taichi_msm.terms.base import KernelConfig, Term
 from taichi_msm.terms.places import Places
 from taichi_msm.terms.points import build_point_functions
-
-# Columns of a slot, see `ProbeForce`; `point` is the control point, x and y at rest [m].
-SLOT = Places(force=3, point=2, falloff=1, shift=1, offset=1)
 
 
 @dataclass(frozen=True)
@@ -35,17 +33,20 @@ class ProbeTerm(Term):
     has_gradient: ClassVar[bool] = True
 
     moves: tuple[bool, ...]  # for each slot, whether its control point moves
-    by_area: tuple[bool, ...]  # for each slot, whether its forces are smaller at an open edge
+    by_area: tuple[bool, ...]  # for each slot, whether its forces are proportional to areas, which vary
+    dimensions: int = 2  # of control points: x and y at rest on a flat sheet, x, y and z on a curved one [m]
 
     @classmethod
     def from_plan(cls, plan: Plan) -> Self:
         probes = plan.scene.probes
         by_area = tuple(plan.areas_vary and probes[slot.probe].total is not None for slot in plan.slots)
-        return cls(tuple(slot.moves for slot in plan.slots), by_area)
+        dimensions = 2 if rest_of(plan.scene.sheet).is_flat else 3
+        return cls(tuple(slot.moves for slot in plan.slots), by_area, dimensions)
 
     @property
     def column_places(self) -> Places:
-        return Places(slots=[SLOT] * len(self.moves))
+        slot = Places(force=3, point=self.dimensions, falloff=1, shift=1, offset=1)  # See `ProbeForce`.
+        return Places(slots=[slot] * len(self.moves))
 
     def columns(self, plan: Plan, loads: Schedule, first: int) -> NDArray[Any]:
         columns = np.empty((len(loads.active), self.column_places.count))
@@ -69,6 +70,7 @@ class ProbeTerm(Term):
         moves, by_area, slots = self.moves, self.by_area, config.columns(ProbeTerm).slots
         vector, lanes, decays = config.vector, config.lanes, self._decay_fields(config)
         _, area_share, rest_position = build_point_functions(config)
+        curved = self.dimensions == 3
 
         @ti.func
         def add(force: ti.template(), sheet: ti.template(), entry: ti.template(), now: ti.template()):
@@ -77,7 +79,11 @@ class ProbeTerm(Term):
                 if ti.static(moves[n]):
                     rest = rest_position(sheet, entry.row.i, entry.b)
                     off_x, off_y = rest[0] - now[slot.point[0]], rest[1] - now[slot.point[1]]
-                    exponent = now[slot.falloff] * ti.sqrt(off_x * off_x + off_y * off_y) + now[slot.shift]
+                    squared = off_x * off_x + off_y * off_y
+                    if ti.static(curved):
+                        off_z = rest[2] - now[slot.point[2]]
+                        squared += off_z * off_z
+                    exponent = now[slot.falloff] * ti.sqrt(squared) + now[slot.shift]
                     exponent = ti.max(exponent, now[slot.offset])
                     factor = vector([ti.exp(-exponent[lane]) for lane in ti.static(range(lanes))])
                     if ti.static(by_area[n]):
@@ -181,6 +187,10 @@ def decay_norm_bound(slot: ProbeSlot, plan: Plan) -> float:
         return float(np.linalg.norm(decay(scene.probes[slot.probe], plan)))
     # The control point is within half a cell's diagonal of some mass point. Four copies of the sheet that meet at this
     # mass point cover the sheet, and their norm is twice that of one copy with the mass point at its corner.
+    if scene.sheet.surface:
+        law = probe_force(scene.probes[slot.probe], scene.sheet)
+        areas = plan.area_shares if law.by_area else np.ones(plan.fixed.shape)
+        return float(law.decay(np.zeros(())) * np.linalg.norm(areas))
     x, y = axes(scene.sheet)
     nearest = np.maximum(np.hypot(x - x[0], y - y[0]) - math.hypot(*spacing(scene.sheet)) / 2, 0)
     return 2 * float(np.linalg.norm(probe_force(scene.probes[slot.probe], scene.sheet).decay(nearest)))

@@ -30,7 +30,9 @@ from typing_extensions import Self
 
 from taichi_msm.laws import law_of
 from taichi_msm.laws.law import Law
+from taichi_msm.model.cells import CellStiffness, cell_stiffness, sum_around_points
 from taichi_msm.model.plan import Plan
+from taichi_msm.model.rest import CurvedRest
 from taichi_msm.model.sheet import Material, Springs, largest_mean, spacing
 from taichi_msm.scene.scene import Scene
 from taichi_msm.scene.sheet import Sheet
@@ -102,7 +104,8 @@ class SpringTerm(Term):
             assert springs is not None
             stiffness = {"across": springs.structural, "down": springs.structural, "shear": springs.shear}
             return {**stiffness, "tension": 0.0, "stiffening": None}
-        dx, dy = spacing(scene.sheet)
+        # On a curved sheet those of a square cell; the springs of its own cells follow from `curved_springs`.
+        dx, dy = (1.0, 1.0) if scene.sheet.surface else spacing(scene.sheet)
         membrane = tissue.young * tissue.thickness
         return {
             "across": membrane * (9 / 8 * dy / dx - 3 / 8 * dx / dy),
@@ -136,7 +139,7 @@ class SpringTerm(Term):
         # With a map, the mass of each mass point is distributed over its cells in proportion to their stiffness. The
         # bound is then multiplied by the largest mean of the factors around a mass point.
         if material.springs is not None:
-            return float(_bounds_of(material, material.springs).max())
+            return float(material.springs.bounds.max()) * _steepest(material)
         largest = 1.0
         if material.factors is not None:
             largest = largest_mean(material.factors) if material.by_area else float(material.factors.max())
@@ -150,11 +153,8 @@ class SpringTerm(Term):
         bounds. In scenes with `springs`, edges are not softer; there the largest factor around the mass point counts.
         """
         if material.springs is not None:
-            return _bounds_of(material, material.springs)
-        factors = material.factors
-        if factors is None:
-            factors = np.ones([count - 1 for count in sheet.points])
-        padded = np.pad(factors, 1)
+            return material.springs.bounds * _steepest(material)
+        padded = np.pad(_factors(material, sheet), 1)
         cells = np.stack([padded[:-1, :-1], padded[:-1, 1:], padded[1:, :-1], padded[1:, 1:]])
         shares = cells.mean(axis=0) if material.by_area else cells.max(axis=0)
         return _unmapped_bound(material) * shares
@@ -174,7 +174,7 @@ class SpringTerm(Term):
         if not self.varied:
             return super().fields(plan)
         points = plan.scene.sheet.points
-        springs, places = assemble_springs(plan.material, points), self.field_places
+        springs, places = assemble_springs(plan.material, plan.scene.sheet), self.field_places
         fields = np.zeros((places.count, *points))
         for family, (k, tau) in enumerate(zip(springs.stiffness, springs.tension, strict=True)):
             rows, cols = k.shape
@@ -525,15 +525,6 @@ def _unmapped_bound(material: Material) -> float:
     return _steepest(material) * 4 * max(across + down, across + 2 * shear, down + 2 * shear)
 
 
-def _bounds_of(material: Material, springs: Springs) -> NDArray[Any]:
-    """Return twice the sum of k at each mass point: the energy k |q|^2 / 2 of a spring is at most k (u_P^2 + u_Q^2)."""
-    bounds = np.zeros(np.add(springs.stiffness[ALONG_ROW].shape, (0, 1)))
-    for k, (start, end) in zip(springs.stiffness, spring_ends(bounds.shape), strict=True):
-        bounds[start] += 2 * k
-        bounds[end] += 2 * k
-    return bounds * _steepest(material)
-
-
 Window = tuple[slice, slice]
 
 
@@ -545,16 +536,49 @@ def spring_ends(points: tuple[int, ...]) -> Iterator[tuple[Window, Window]]:
         yield start, (slice(down, rows), slice(max(0, right), cols - max(0, -right)))
 
 
-def assemble_springs(material: Material, points: tuple[int, int]) -> Springs:
-    """Return the springs of a sheet of rows and columns of mass points as arrays."""
+def assemble_springs(material: Material, sheet: Sheet) -> Springs:
+    """Return the springs of a sheet as arrays."""
     if material.springs is not None:
         return material.springs
-    unmapped = np.ones([count - 1 for count in points])
-    factors = unmapped if material.factors is None else material.factors
-    along_rows, along_columns, diagonals = spring_stiffness(material, factors)
+    along_rows, along_columns, diagonals = spring_stiffness(material, _factors(material, sheet))
     # The tension at rest does not depend on the map.
+    unmapped = np.ones([count - 1 for count in sheet.points])
     tensions = [k * material.tension for k in spring_stiffness(material, unmapped)]
-    return Springs((along_rows, along_columns, diagonals, diagonals), (*tensions, tensions[DIAGONAL]), rest=None)
+    stiffness = along_rows, along_columns, diagonals, diagonals
+    bounds = np.asarray(SpringTerm.node_stiffness_bounds(material, sheet)) / _steepest(material)
+    return Springs(stiffness, (*tensions, tensions[DIAGONAL]), None, bounds)
+
+
+def curved_springs(material: Material, sheet: Sheet, rest: CurvedRest, membrane: float) -> Springs:
+    """Return the springs of a curved sheet, for E t of tissue [N/m], 0 for the given coefficients of `springs`."""
+    if membrane == 0:
+        return assemble_springs(material, sheet)._replace(rest=rest.position)
+    squares = [
+        ((rest.position[end] - rest.position[start]) ** 2).sum(axis=-1) for start, end in spring_ends(sheet.points)
+    ]
+
+    def stiffness_of(cell: CellStiffness) -> list[NDArray[Any]]:
+        above_and_below, left_and_right = np.pad(cell.along_a, ((1, 1), (0, 0))), np.pad(cell.along_b, ((0, 0), (1, 1)))
+        along_rows, along_columns = (
+            above_and_below[:-1] + above_and_below[1:],
+            left_and_right[:, :-1] + left_and_right[:, 1:],
+        )
+        families = along_rows, along_columns, cell.falling, cell.rising
+        return [k * square for k, square in zip(families, squares, strict=True)]
+
+    cell = cell_stiffness(rest.cells, membrane * _factors(material, sheet))
+    stiffness, unmapped = stiffness_of(cell), stiffness_of(cell_stiffness(rest.cells, membrane))
+    # Bound of each cell: the larger of its two sides along a and along b, its diagonals, with its own stiffness alone.
+    k_a = cell.along_a * np.maximum(squares[ALONG_ROW][:-1], squares[ALONG_ROW][1:])
+    k_b = cell.along_b * np.maximum(squares[ALONG_COLUMN][:, :-1], squares[ALONG_COLUMN][:, 1:])
+    k_m, k_n = stiffness[FALLING:]
+    bounds = np.maximum(2 * (k_a + k_b), k_a + k_b + k_m + k_n + np.hypot(k_a - k_b, k_m - k_n))
+    return Springs(stiffness, [k * material.tension for k in unmapped], rest.position, sum_around_points(bounds))
+
+
+def _factors(material: Material, sheet: Sheet) -> NDArray[Any]:
+    """Return the factors of the cells of a sheet, shape (rows - 1, cols - 1)."""
+    return np.ones([count - 1 for count in sheet.points]) if material.factors is None else material.factors
 
 
 def spring_stiffness(material: Material, factors: NDArray[Any]) -> tuple[NDArray[Any], NDArray[Any], NDArray[Any]]:

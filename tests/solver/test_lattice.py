@@ -72,13 +72,18 @@ def assembled(plan: Plan) -> TwinSheet:
 
 def random_springs(plan: Plan, *, tense: bool = False, curved: bool = False) -> Springs:
     """Springs of random stiffness, 5 % of them absent."""
-    rng, own = np.random.default_rng(5), assemble_springs(plan.material, (ROWS, COLS))
+    rng, own = np.random.default_rng(5), assemble_springs(plan.material, plan.scene.sheet)
     stiffness = [k * rng.uniform(0.5, 2, k.shape) * (rng.random(k.shape) > 0.05) for k in own.stiffness]
     rest = rest_positions(plan.scene.sheet) + 0.2 * rng.uniform(0, 0.01, (ROWS, COLS, 3)) if curved else None
     if rest is not None:
         rest[..., 2] += 8 * rest[..., 0] ** 2 - 5 * rest[..., 1] ** 2
     tension = [k * (0.1 * tense) for k in stiffness]
-    return Springs(tuple(stiffness), tuple(tension), rest)
+    # The energy k |q|^2 / 2 of a spring is at most k (u_P^2 + u_Q^2).
+    bounds = np.zeros((ROWS, COLS))
+    for k, ends in zip(stiffness, spring_ends((ROWS, COLS)), strict=True):
+        for end in ends:
+            bounds[end] += 2 * k
+    return Springs(tuple(stiffness), tuple(tension), rest, bounds)
 
 
 def points() -> dict[str, Any]:

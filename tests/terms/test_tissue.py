@@ -151,7 +151,7 @@ def test_pretension_straightens_the_sheet_after_a_load(load: Any, device: Device
 INVALID = [
     "springs={structural: 1}", "sheet.mass=1", "damping=0.1", "probes.0={force: [0, 0, 1]}", "probes.0.force=[0, 0, 1]",
     "probes.0.offset=3", "probes.0.falloff=0", "sheet.points=[13, 40]", "sheet.points=[40, 13]",
-    "sheet={points: [13, 15], size: [100, 0.001]}", "probes.0.total=5", "tissue.pretension=90", "tissue.young=0",
+    "sheet={points: [13, 15], size: [100, 0.001]}", "probes.0.total=[5]", "tissue.pretension=90", "tissue.young=0",
     "sheet.size=0", "tissue.density=0", "tissue.bending=thick", "tissue.map={image: map.png}",
 ]  # fmt: skip
 

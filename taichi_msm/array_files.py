@@ -1,0 +1,76 @@
+"""Reading arrays of numbers from .npy and .npz files, which may be corrupt or malicious."""
+
+from __future__ import annotations
+
+import hashlib
+import io
+import zipfile
+from collections.abc import Callable, Sequence
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+from taichi_msm.images import PictureError, actual_path
+from taichi_msm.system.files import read_regular
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+# Largest file, and largest array in it [bytes]: 4096 x 4096 points of three float64 numbers, with some margin.
+MAX_BYTES = 2**29
+
+
+class ArrayFile(NamedTuple):
+    """Numbers of a file in metres."""
+
+    values: NDArray[Any]  # float64
+    sha256: str  # of the file
+    step: float  # distance of two neighbouring values that the file can hold [m]; 0 for floating-point numbers
+
+
+def read_array_file(
+    path: str, unit: float, names: Sequence[str], is_shape: Callable[[tuple[int, ...]], bool], shapes: str
+) -> ArrayFile:
+    """Read the array of an .npy, or one of an .npz by its name or as its only one, and convert it from `unit` [m].
+
+    A PictureError reports a file without an array of an allowed shape, `shapes` in words, of finite numbers.
+    """
+    import numpy as np
+
+    try:
+        data = read_regular(actual_path(path), MAX_BYTES)
+    except (OSError, ValueError) as error:
+        reason = getattr(error, "strerror", None) or str(error)
+        raise PictureError(f"{path}: {reason.lower()}", "name an .npy or .npz file that can be read") from None
+    remedy = f"save an array of numbers of shape {shapes} with numpy.save"
+    try:
+        array = _load(path, data, names)
+    except (ValueError, OSError, EOFError, KeyError, zipfile.BadZipFile, NotImplementedError, RuntimeError) as error:
+        raise PictureError(f"{path} is not an .npy or .npz file ({str(error).splitlines()[0]})", remedy) from None
+    if array.dtype.kind not in "fiu":
+        raise PictureError(f"{path}: {array.dtype} is not numeric", remedy)
+    if not is_shape(array.shape) or 0 in array.shape:
+        raise PictureError(f"{path}: shape {array.shape}", remedy)
+    finite = np.isfinite(array)
+    if not finite.all():
+        at = ", ".join(map(str, np.unravel_index(int((~finite).argmax()), array.shape)))
+        raise PictureError(f"{path}: [{at}] is {array[~finite][0]}", "give a finite number there")
+    step = 0.0 if array.dtype.kind == "f" else unit
+    return ArrayFile(array.astype(np.float64) * unit, hashlib.sha256(data).hexdigest(), step)
+
+
+def _load(path: str, data: bytes, names: Sequence[str]) -> NDArray[Any]:
+    """Return the array of a file's content."""
+    import numpy as np
+
+    if data[:2] != b"PK":
+        array: NDArray[Any] = np.load(io.BytesIO(data), allow_pickle=False)
+        return array
+    with zipfile.ZipFile(io.BytesIO(data)) as archive:
+        members = {info.filename.removesuffix(".npy"): info for info in archive.infolist()}
+        name = next((name for name in names if name in members), next(iter(members)) if len(members) == 1 else None)
+        if name is None:
+            raise PictureError(f"{path} has {', '.join(sorted(members)[:9])}", f"name one of its arrays {names[0]}")
+        if members[name].file_size > MAX_BYTES:
+            raise PictureError(f"{path}: {name} has {members[name].file_size:,} bytes", f"take at most {MAX_BYTES:,}")
+        with archive.open(members[name]) as member:
+            array = np.load(io.BytesIO(member.read(MAX_BYTES)), allow_pickle=False)
+    return array

@@ -1,0 +1,272 @@
+"""The sheet at rest: positions, normals and areas of its mass points, flat or curved.
+
+Places on the sheet are fractions (across, down) of its width from the left and of its height from the top, the u and v
+of a curved sheet. Between mass points a sheet at rest is bilinear; beyond its edges, the outermost cells are continued.
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Callable
+from functools import cached_property, lru_cache
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from taichi_msm.model.cells import Cells, point_normals, sum_around_points
+from taichi_msm.scene.sheet import Sheet
+from taichi_msm.scene.surface import Dome, HeightField, PointGrid, Tube
+
+Array = NDArray[np.float64]
+
+
+class Rest(ABC):
+    """The sheet at rest.
+
+    Its coordinates are x and y [m] of a flat sheet, and fractions across and down of a curved one: control points and
+    paths of tools are linear in them.
+    """
+
+    position: Array  # of the mass points [m], shape (rows, cols, 3), read-only
+    cell_area: float  # area of a cell, on a curved sheet the mean [m2]
+    cell_sides: tuple[float, float]  # lengths along rows and along columns, on a curved sheet the means [m]
+    shortest_side: float  # of the sides of all cells [m]
+    longest_side: float
+
+    @property
+    @abstractmethod
+    def box(self) -> Array:
+        """Lower and upper corner of the sheet's box [m], shape (2, 3)."""
+
+    @property
+    def extent(self) -> float:
+        """Larger side of the box [m]."""
+        return float(np.ptp(self.box, axis=0).max())
+
+    @property
+    def is_flat(self) -> bool:
+        """Whether the sheet is a rectangle in the plane z = 0."""
+        return isinstance(self, FlatRest)
+
+    @abstractmethod
+    def coordinates(self, fractions: Array) -> Array:
+        """Return the coordinates of places, shape (..., 2) each."""
+
+    @abstractmethod
+    def fractions(self, coordinates: Array) -> Array:
+        """Return the fractions across and down of places, shape (..., 2) each."""
+
+    @abstractmethod
+    def place(self, coordinates: Array) -> Array:
+        """Return the positions of places [m], shape (n, 3), for coordinates of shape (n, 2)."""
+
+    @abstractmethod
+    def normals(self, coordinates: Array) -> Array:
+        """Return the unit normals at places, shape (n, 3), for coordinates of shape (n, 2)."""
+
+    @abstractmethod
+    def load_points(self, coordinates: Array) -> Array:
+        """Return x and y of places on a flat sheet, shape (n, 2), x, y and z on a curved one, shape (n, 3) [m]."""
+
+    @abstractmethod
+    def distances(self, coordinates: Array) -> Array:
+        """Return the distance of every mass point from a place [m], shape (rows, cols)."""
+
+
+class FlatRest(Rest):
+    """A rectangle in the plane z = 0 about the origin."""
+
+    def __init__(self, points: tuple[int, int], size: tuple[float, float]) -> None:
+        (rows, cols), (height, width) = points, size
+        self._size = size
+        # x of the columns, shape (cols,), and y of the rows, shape (rows, 1).
+        self._axes = (
+            (np.arange(cols) / (cols - 1) - 0.5) * width,
+            (0.5 - np.arange(rows)[:, None] / (rows - 1)) * height,
+        )
+        self.position = np.zeros((rows, cols, 3))
+        self.position[..., 0], self.position[..., 1] = self._axes
+        self.position.flags.writeable = False
+        dx, dy = width / (cols - 1), height / (rows - 1)
+        self.cell_area, self.cell_sides = dx * dy, (dx, dy)
+        self.shortest_side, self.longest_side = min(dx, dy), max(dx, dy)
+
+    @property
+    def box(self) -> Array:
+        height, width = self._size
+        return np.array([[-width / 2, -height / 2, 0.0], [width / 2, height / 2, 0.0]])
+
+    @property
+    def extent(self) -> float:
+        return max(self._size)
+
+    def coordinates(self, fractions: Array) -> Array:
+        height, width = self._size
+        across, down = np.moveaxis(fractions, -1, 0)
+        return np.stack([(across - 0.5) * width, (0.5 - down) * height], axis=-1)
+
+    def fractions(self, coordinates: Array) -> Array:
+        height, width = self._size
+        x, y = np.moveaxis(coordinates, -1, 0)
+        return np.stack([x / width + 0.5, 0.5 - y / height], axis=-1)
+
+    def place(self, coordinates: Array) -> Array:
+        return np.concatenate([coordinates, np.zeros((len(coordinates), 1))], axis=1)
+
+    def normals(self, coordinates: Array) -> Array:
+        return np.tile([0.0, 0.0, 1.0], (len(coordinates), 1))
+
+    def load_points(self, coordinates: Array) -> Array:
+        return coordinates
+
+    def distances(self, coordinates: Array) -> Array:
+        (x, y), (at_x, at_y) = self._axes, coordinates
+        return np.hypot(x - at_x, y - at_y)
+
+
+class CurvedRest(Rest):
+    """Mass points anywhere in space."""
+
+    def __init__(self, position: Array) -> None:
+        self.position = position
+        self.position.flags.writeable = False
+        self.cells = Cells.of(position)
+        self.cell_area = float(self.cells.area.mean())
+        self.cell_sides = float(self.cells.side_a.mean()), float(self.cells.side_b.mean())
+        sides = np.concatenate([self.cells.side_a.ravel(), self.cells.side_b.ravel()])
+        self.shortest_side, self.longest_side = float(sides.min()), float(sides.max())
+
+    @cached_property
+    def box(self) -> Array:
+        return np.stack([self.position.min(axis=(0, 1)), self.position.max(axis=(0, 1))])
+
+    @cached_property
+    def areas(self) -> Array:
+        """Area of every mass point [m2], shape (rows, cols)."""
+        return sum_around_points(self.cells.area / 4)
+
+    @cached_property
+    def point_normals(self) -> Array:
+        """Unit normals at the mass points, shape (rows, cols, 3)."""
+        return point_normals(self.cells)
+
+    def coordinates(self, fractions: Array) -> Array:
+        return np.asarray(fractions, dtype=float)
+
+    def fractions(self, coordinates: Array) -> Array:
+        return coordinates
+
+    def place(self, coordinates: Array) -> Array:
+        return self._interpolate(self.position, coordinates)
+
+    def normals(self, coordinates: Array) -> Array:
+        normals = self._interpolate(self.point_normals, coordinates)
+        return normals / np.linalg.norm(normals, axis=1, keepdims=True)
+
+    load_points = place
+
+    def distances(self, coordinates: Array) -> Array:
+        return np.asarray(np.linalg.norm(self.position - self.place(coordinates[None]), axis=-1))
+
+    def _interpolate(self, values: Array, coordinates: Array) -> Array:
+        """Interpolate values at the mass points, shape (rows, cols, 3), bilinearly within cells."""
+        rows, cols = values.shape[:2]
+        at = coordinates * (cols - 1, rows - 1)
+        j, i = np.clip(np.floor(at).astype(int), 0, (cols - 2, rows - 2)).T
+        s, t = (at - np.stack([j, i], axis=1)).T[..., None]
+        upper = values[i, j] + s * (values[i, j + 1] - values[i, j])
+        lower = values[i + 1, j] + s * (values[i + 1, j + 1] - values[i + 1, j])
+        return np.asarray(upper + t * (lower - upper))
+
+
+def rest_of(sheet: Sheet) -> Rest:
+    """Return the sheet at rest; a PictureError if the file of its surface cannot be used."""
+    file = sheet.surface.file if sheet.surface else None
+    return _rest(sheet.points, sheet.size, _Surface(sheet, file.sha256 if file else ""))
+
+
+def rest_normals(sheet: Sheet) -> Array:
+    """Return the unit normals at the mass points at rest, shape (rows, cols, 3)."""
+    rest = rest_of(sheet)
+    return rest.point_normals if isinstance(rest, CurvedRest) else np.tile([0.0, 0.0, 1.0], (*sheet.points, 1))
+
+
+class _Surface:
+    """The surface of a sheet as the key of a cache: equal with equal keys and an equal file."""
+
+    def __init__(self, sheet: Sheet, sha256: str) -> None:
+        self.sheet, self._key = sheet, (sheet.surface, sha256)
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, _Surface) and self._key == other._key
+
+    def __hash__(self) -> int:
+        return hash(self._key)
+
+
+@lru_cache(maxsize=16)
+def _rest(points: tuple[int, int], size: tuple[float, float], surface: _Surface) -> Rest:
+    if surface.sheet.surface is None:
+        return FlatRest(points, size)
+    (rows, cols), (height, width) = points, size
+    u, v = np.arange(cols) / (cols - 1), np.arange(rows) / (rows - 1)
+    kind = surface.sheet.surface.kind
+    return CurvedRest(KINDS[kind](getattr(surface.sheet.surface, kind), u, v, width, height))
+
+
+def _height(field: HeightField, u: Array, v: Array, width: float, height: float) -> Array:
+    x, y = np.meshgrid((u - 0.5) * width, (0.5 - v) * height)
+    return np.stack([x, y, sample_bilinearly(field.heights.values, v, u)], axis=-1)
+
+
+def _tube(tube: Tube, u: Array, v: Array, width: float, height: float) -> Array:
+    radius, (x, y) = tube.radius, np.meshgrid((u - 0.5) * width, (0.5 - v) * height)
+    r = np.full(x.shape, radius)
+    if tube.folds is not None:
+        r -= tube.folds.depth * (1 + np.cos(2 * np.pi * y / tube.folds.spacing)) / 2
+    return np.stack([r * np.sin(x / radius), y, radius - r * np.cos(x / radius)], axis=-1)
+
+
+def _dome(dome: Dome, u: Array, v: Array, width: float, height: float) -> Array:
+    radius = dome.radius
+    x, y = (np.tan(each / radius) for each in np.meshgrid((u - 0.5) * width, (0.5 - v) * height))
+    length = np.sqrt(1 + x * x + y * y)
+    # 1 / length - 1 without cancellation.
+    return radius * np.stack([x / length, y / length, -(x * x + y * y) / (length * (1 + length))], axis=-1)
+
+
+def _points(grid: PointGrid, u: Array, v: Array, width: float, height: float) -> Array:  # noqa: ARG001
+    from scipy.interpolate import CubicSpline
+
+    positions = grid.points.values
+    if positions.shape[:2] == (len(v), len(u)):
+        return positions.copy()
+    for axis, fractions in enumerate((v, u)):
+        positions = CubicSpline(np.linspace(0, 1, positions.shape[axis]), positions, axis)(fractions)
+    return positions
+
+
+# Positions of the mass points [m] of each kind of surface, for u of the columns and v of the rows.
+KINDS: dict[str, Callable[[Any, Array, Array, float, float], Array]] = {
+    "height": _height,
+    "tube": _tube,
+    "dome": _dome,
+    "points": _points,
+}
+
+
+def sample_bilinearly(values: NDArray[Any], rows: Array, cols: Array) -> Array:
+    """Sample pixels bilinearly between their centres, constant beyond them, shape (m, n).
+
+    `rows`, shape (m,), and `cols`, shape (n,), are fractions of the height from the top and of the width from the left.
+    """
+    height, width = values.shape
+    row = np.clip(rows * height - 0.5, 0, height - 1)
+    column = np.clip(cols * width - 0.5, 0, width - 1)
+    top, left = row.astype(int), column.astype(int)
+    bottom, right = np.minimum(top + 1, height - 1), np.minimum(left + 1, width - 1)
+    down, across = (row - top)[:, None], column - left
+    above = values[np.ix_(top, left)] * (1 - across) + values[np.ix_(top, right)] * across
+    below = values[np.ix_(bottom, left)] * (1 - across) + values[np.ix_(bottom, right)] * across
+    return np.asarray(above * (1 - down) + below * down)
