@@ -79,19 +79,21 @@ def _integral(e: Array, m: float, factor: float) -> Array:
 def foundation_force(scene: Scene, displacement: Array, assembled: Sheet | None = None) -> Array:
     """Return the force of the virtual springs while they are active [N], shape (rows, cols, 3).
 
-    -K u (eq. 4), with `lock` of the depth -u_z where the foundation locks.
+    -K u (eq. 4); where the foundation locks, with `lock` of the depth along the normal at rest, w = -u . N.
 
     Args:
         scene: scene with virtual springs or a foundation.
         displacement: u [m], shape (rows, cols, 3).
         assembled: another sheet than the scene's.
     """
-    k = (assembled or sheet(scene)).virtual
+    assembled = assembled or sheet(scene)
+    k, normal = assembled.virtual, assembled.normal
     force = -k[..., None] * displacement
     foundation = None if scene.tissue is None else scene.tissue.foundation
     if isinstance(foundation, Foundation) and foundation.lock is not None:
-        depth = -displacement[..., 2]
-        force[..., 2] = k * np.where(depth > 0, lock(depth, foundation.lock, foundation.factor), depth)
+        depth = -(displacement * normal).sum(axis=-1)
+        more = np.where(depth > 0, lock(depth, foundation.lock, foundation.factor) - depth, 0)
+        force += (k * more)[..., None] * normal
     return force
 
 
@@ -117,7 +119,10 @@ def bending_force(scene: Scene, displacement: Array, assembled: Sheet | None = N
         displacement: u [m], shape (rows, cols, 3), real or complex.
         assembled: another sheet than the scene's.
     """
-    (dx, dy), moment = spacing(scene.sheet), (assembled or sheet(scene)).bending * _laplacian(scene, displacement)
+    assembled = assembled or sheet(scene)
+    if assembled.is_curved:
+        return np.zeros_like(displacement)
+    (dx, dy), moment = spacing(scene.sheet), assembled.bending * _laplacian(scene, displacement)
     force = np.zeros(displacement.shape, moment.dtype)
     force[1:-1, 1:-1] += (2 / dx**2 + 2 / dy**2) * moment
     force[1:-1, 2:] -= moment / dx**2
@@ -152,7 +157,7 @@ def _strains(scene: Scene, displacement: Array) -> Iterator[Array]:
         yield (_ends_apart(springs, displacement)[1] / springs.length)[springs.stiffness > 0]
 
 
-def energy(scene: Scene, displacement: Array) -> float:
+def energy(scene: Scene, displacement: Array, assembled: Sheet | None = None) -> float:
     """Return the elastic energy of springs and bending above that at rest [J], without the virtual springs.
 
     The sum of k ((L - L0)^2 - (L_rest - L0)^2) / 2, less the part linear in u, and of D / 2 |Laplacian|^2 dx dy.
@@ -160,14 +165,16 @@ def energy(scene: Scene, displacement: Array) -> float:
     Args:
         scene: scene with springs or tissue.
         displacement: u [m], shape (rows, cols, 3).
+        assembled: another sheet than the scene's.
     """
-    assembled = sheet(scene)
-    total = assembled.bending / 2 * float((_laplacian(scene, displacement) ** 2).sum())
+    assembled, total = assembled or sheet(scene), 0.0
+    if not assembled.is_curved:
+        total = assembled.bending / 2 * float((_laplacian(scene, displacement) ** 2).sum())
     for springs in assembled.springs:
         between, length = _ends_apart(springs, displacement)
         rest = springs.length - springs.unstretched
         # The part that is linear in the displacements cancels in the sum, as the sheet is in equilibrium at rest.
-        linear = (between - springs.offset) @ springs.offset * rest / springs.length
+        linear = ((between - springs.offset) * springs.offset).sum(axis=-1) * rest / springs.length
         strained = (length - springs.unstretched) ** 2 / 2 - rest**2 / 2 - linear
         total += float((springs.stiffness * strained).sum())
         if scene.tissue is not None and scene.tissue.stiffening is not None:

@@ -17,7 +17,7 @@ from taichi_msm.model.sheet import rest_positions
 from taichi_msm.model.tools import solid_tools
 from taichi_msm.scene.scene import Scene
 from tests.reference.dynamics import energy, force, surgical_force, tangent
-from tests.reference.sheet import sheet
+from tests.reference.sheet import Sheet, sheet
 
 Array = NDArray[np.float64]
 
@@ -142,7 +142,9 @@ def equilibrium_outside_tool(plan: Plan, loads: Schedule, time: float, size: flo
     return spread(solution.x)
 
 
-def stiffness(scene: Scene, displacement: Array | float = 0.0, active: float = 1.0) -> Any:
+def stiffness(
+    scene: Scene, displacement: Array | float = 0.0, active: float = 1.0, assembled: Sheet | None = None
+) -> Any:
     """Return the stiffness matrix, -dF/du without the probes [N/m]: sparse, shape (3 rows cols, 3 rows cols).
 
     By 75 products with `tangent`: a point feels at most two rows and columns of neighbours, so every fifth row and
@@ -150,13 +152,14 @@ def stiffness(scene: Scene, displacement: Array | float = 0.0, active: float = 1
 
     Args:
         scene: scene with springs or tissue.
-        displacement: u at which it is taken [m], shape (rows, cols, 3), or 0 for the flat sheet.
+        displacement: u at which it is taken [m], shape (rows, cols, 3), or 0 for the sheet at rest.
         active: share of the virtual springs that are active, 0 to 1.
+        assembled: another sheet than the scene's.
     """
     rows, cols = scene.sheet.points
     u = np.zeros((rows, cols, 3)) + displacement
     number, (i, j) = np.arange(u.size).reshape(u.shape), np.mgrid[:rows, :cols]
-    assembled, entries = sheet(scene), []
+    assembled, entries = assembled or sheet(scene), []
     for down, right, axis in itertools.product(range(5), range(5), range(3)):
         change = np.zeros_like(u)
         change[down::5, right::5, axis] = 1
