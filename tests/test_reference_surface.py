@@ -12,12 +12,19 @@ from numpy.typing import NDArray
 from PIL import Image
 from scipy.sparse.linalg import spsolve
 
+from taichi_msm.model.loads import average_loads, evaluate_frame_loads
+from taichi_msm.model.plan import Plan
+from taichi_msm.model.tools import solid_tools
 from taichi_msm.scene.scene import Scene
+from taichi_msm.scene.tools import Probe
 from taichi_msm.solver.planning import make_plan
 from tests import reference
 from tests.reference import surface
+from tests.reference.contact import centre, lowest_point
+from tests.reference.dynamics import probe_force
+from tests.reference.loads import Loads, frame_loads, step_loads
 from tests.reference.sheet import Sheet, highest_frequency, largest_pressure, sheet
-from tests.scenes import scene
+from tests.scenes import plan_of, random_scene, random_tissue, scene, speckle
 
 Array = NDArray[np.float64]
 
@@ -34,6 +41,20 @@ def tissue(points: tuple[int, int], size: tuple[float, float] = (0.05, 0.05), **
         springs=None,
         damping=0,
         probes=[],
+    )
+
+
+def moving(points: tuple[int, int], probes: list[dict[str, Any]], **changes: Any) -> Scene:
+    """A short run of tissue with tools."""
+    sides = {"fixed": changes.pop("fixed", ["left"])}
+    return scene(
+        sheet={"points": points, "size": (0.05, 0.06), **sides},
+        tissue={**TISSUE, "foundation_active": "always", "damping": 40, **changes.pop("tissue", {})},
+        springs=None,
+        damping=0,
+        probes=probes,
+        time={"duration": 0.02, "frames_per_second": 100, **changes.pop("time", {})},
+        **changes,
     )
 
 
@@ -290,3 +311,140 @@ def test_force_is_the_slope_of_the_energy(kind: Any) -> None:
     slope = (after - before) / (2 * d)
     # The error of the difference is d^2 / 6 times the third derivative, with lengths of 1e-3 and above.
     np.testing.assert_allclose(-(reference.elastic_force(made, u, assembled) * direction).sum(), slope, rtol=1e-6)
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_loads_and_forces_of_flat_sheets(seed: int, tmp_path: Path) -> None:
+    """Loads in fractions of the sheet, and forces in space, against those in the plane; jumps are in some seeds."""
+    Image.fromarray(speckle(6, 7)[..., 0]).save(tmp_path / "grey.png")
+    made = random_tissue(seed, str(tmp_path / "grey.png")) if seed % 2 else random_scene(seed)
+    plan = plan_of(made)
+    bent, flat = sheet(made, surface.flat_positions(made.sheet.points, made.sheet.size)), sheet(made)
+    schedules: list[tuple[Loads, Any]] = [(step_loads(plan), average_loads(plan, 0, plan.grid.steps))]
+    schedules += [(frame_loads(plan, n), evaluate_frame_loads(plan, n)) for n in range(plan.grid.frames + 1)]
+    for loads, schedule in schedules:
+        np.testing.assert_allclose(loads.active, schedule.active, rtol=0, atol=1e-9)
+        forces = np.array([reference.surgical_force(made, schedule, n, flat) for n in range(len(schedule.active))])
+        for n, force in enumerate(forces):
+            actual = reference.surgical_force(made, loads, n, bent)
+            np.testing.assert_allclose(actual, force, rtol=0, atol=1e-9 * np.abs(forces).max())
+
+
+def motion(plan: Plan, assembled: Sheet | None = None) -> tuple[Array, Array]:
+    """Displacements of all steps [m], and forces of all tools on the mass points [N]."""
+    u, contacts = zip(
+        *((u.copy(), contact.force.copy()) for u, contact in reference.steps(plan, assembled)), strict=True
+    )
+    return np.array(u), np.array(contacts)
+
+
+ROD = {"radius": 0.006, "shaft": [0.3, -0.5, 1], "length": 0.1}
+DRAG = {
+    "path": [[0, 0.55, 0.4, 0.0005], [0.01, 0.5, 0.45, -0.004], [0.02, 0.7, 0.5, -0.003]],
+    "instrument": ROD,
+    "friction": 0.3,
+}
+GRIP = {"path": [[0, 0.7, 0.7, 0.0005], [0.02, 0.75, 0.6, 0.006]], "instrument": ROD, "grip": [[0.003, 0.015]]}
+CLAMP = {"clamp": "right", "path": [[0, 0, 0, 0], [0.02, 0.003, 0, 0.002]]}
+PUSH = {"at": [[0, 0.4, 0.4], [0.015, 0.6, 0.7]], "radius": 0.005, "falloff": 300, "load": [[0, 0], [0.01, 100]]}
+LOCKS = {"stiffening": {"lock": 0.3}, "foundation": {"young": 2e4, "depth": 0.01, "lock": 0.003}}
+RELAXING = {"foundation": 1e6, "relaxation": [{"share": 0.5, "time": 0.01}]}
+MOTIONS: dict[str, Scene] = {
+    "linear": moving((9, 11), [{**PUSH, "total": [0.1, 0.2, -0.9]}], tissue={"foundation": 1e6}),
+    "locks": moving((9, 11), [{**PUSH, "total": [0, 0, -2.0]}, CLAMP], tissue=LOCKS),
+    "contact": moving((11, 13), [DRAG, GRIP], tissue={"foundation": 1e6}),
+    "backward": moving((9, 11), [DRAG], tissue=LOCKS, time={"damping_difference": "backward"}),
+    "relaxing": moving((9, 11), [DRAG], tissue=RELAXING),
+    "tense": moving((9, 11), [{**PUSH, "total": [0, 0, -3]}], tissue={"pretension": 8, **LOCKS}, fixed="border"),
+}
+TURN = np.linalg.qr(np.random.default_rng(1).normal(size=(3, 3)))[0]
+TURN = TURN * np.linalg.det(TURN)
+
+
+def turned(probe: dict[str, Any]) -> dict[str, Any]:
+    """A tool in world axes, turned with the sheet; heights are along the normal as they are."""
+    changed = dict(probe)
+    if "instrument" in probe:
+        changed["instrument"] = {**probe["instrument"], "shaft": (TURN @ probe["instrument"]["shaft"]).tolist()}
+    if "clamp" in probe:
+        changed["path"] = [[t, *(TURN @ u).tolist()] for t, *u in probe["path"]]
+    if "total" in probe:
+        changed["total"] = (TURN @ probe["total"]).tolist()
+    return changed
+
+
+@pytest.mark.parametrize("name", list(MOTIONS))
+def test_motion_of_flat_and_turned_surfaces(name: str) -> None:
+    """A flat surface anywhere in space moves as a flat sheet, turned with its foundation and its tools."""
+    made = MOTIONS[name]
+    probes = [turned(probe.model_dump(mode="json", exclude_defaults=True)) for probe in made.probes]
+    made_turned = Scene.model_validate({**made.model_dump(exclude_defaults=True), "probes": probes})
+    plan, plan_turned = plan_of(made), plan_of(made_turned)
+    rest = surface.flat_positions(made.sheet.points, made.sheet.size)
+    expected, flat = motion(plan), motion(plan, sheet(made, rest))
+    away = motion(plan_turned, sheet(made_turned, rest @ TURN.T + [0.3, -0.2, 0.5]))
+    assert np.abs(expected[0]).max() > 1e-3
+    for wanted, found, found_turned in zip(expected, flat, away, strict=True):
+        # A rounding per step, amplified by the number of steps; far from the origin, of a larger number.
+        atol = 1e-13 * plan.grid.steps * np.abs(wanted).max(initial=1e-300)
+        np.testing.assert_allclose(found, wanted, rtol=0, atol=atol)
+        np.testing.assert_allclose(found_turned @ TURN, wanted, rtol=0, atol=10 * atol)
+
+
+def test_numbers_act_along_the_normal() -> None:
+    shape: dict[str, Any] = {"radius": 0.004, "falloff": 600.0}
+    along, tool = (Probe.model_construct(total=total, **shape) for total in (-2.0, (0.0, 0.0, -2.0)))
+    made = tissue((31, 31), (0.06, 0.06))
+    dome = curved(made, DOME)
+    force = probe_force(along, dome, 0.3, 0.6).sum(axis=(0, 1))
+    normal = (surface.at_fractions(dome.rest, 0.3, 0.6) + np.array([0, 0, 0.05])) / 0.05
+    # Normals of a mesh are off by the square of half a cell's angle; the tool is as wide as some cells, and so the sum
+    # over mass points as right as that.
+    np.testing.assert_allclose(force, -2 * normal, atol=0.05)
+    np.testing.assert_allclose(np.cross(force, normal), 0, atol=2 * 0.02**2)
+    plane = sheet(made, surface.flat_positions((31, 31), (0.06, 0.06)) @ TURN.T)
+    wanted = probe_force(tool, curved(made, None), 0.5, 0.4)
+    np.testing.assert_allclose(probe_force(along, plane, 0.5, 0.4) @ TURN, wanted, rtol=0, atol=1e-12)
+
+
+def test_paths_follow_the_surface() -> None:
+    """A rod and a plate over a dome: at mass points, half way along a straight path, and outside the sheet."""
+    shaft, path = [0.6, 0.0, 0.8], [[0, 0.25, 0.5, 0.01], [0.02, 0.75, 0.5, 0.03], [1, 1.25, 0.5, 0.03]]
+    for instrument, is_plate in (({"radius": 0.004}, False), ({"plate": 0.004}, True)):
+        rod = {"path": path, "instrument": {**instrument, "shaft": shaft, "length": 0.1}}
+        made = moving((9, 9), [rod])
+        dome, tool = curved(made, DOME), solid_tools(plan_of(made).tools)[0]
+        for time, j, height in ((0.0, 2, 0.01), (0.01, 4, 0.02), (0.02, 6, 0.03)):
+            normal = dome.normal[4, j]
+            tip = np.linalg.norm(np.cross(shaft, normal)) if is_plate else 1
+            wanted = dome.rest[4, j] + (height + 0.004 * tip) * normal
+            np.testing.assert_allclose(centre(made, tool, time, dome), wanted, rtol=0, atol=1e-15)
+        # Two columns beyond the right side, positions and normals of the last cell go on.
+        normal = 3 * dome.normal[4, 8] - 2 * dome.normal[4, 7]
+        wanted = 3 * dome.rest[4, 8] - 2 * dome.rest[4, 7] + 0.03 * normal / np.linalg.norm(normal)
+        np.testing.assert_allclose(lowest_point(made, tool, 2.0, dome)[0], wanted, rtol=0, atol=1e-15)
+
+
+def test_tangent_is_the_slope_of_the_force() -> None:
+    made = tissue((6, 7), (0.04, 0.06), pretension=5, **LOCKS)
+    assembled = sheet(made, uneven((6, 7)))
+    rng = np.random.default_rng(7)
+    u, direction, d = rng.uniform(-4e-3, 4e-3, (6, 7, 3)), rng.uniform(-1, 1, (6, 7, 3)), 1e-9
+    after, before = (
+        reference.elastic_force(made, v, assembled) + reference.foundation_force(made, v, assembled)
+        for v in (u + d * direction, u - d * direction)
+    )
+    tangent = reference.tangent(made, u, direction, 1.0, assembled)
+    np.testing.assert_allclose(tangent, (after - before) / (2 * d), rtol=0, atol=1e-5 * np.abs(tangent).max())
+
+
+def test_equilibrium_of_a_dome_that_locks() -> None:
+    """A load off the middle; sheet and foundation are stretched and pressed far into their laws."""
+    push = {"total": [0, 0, -1.5], "at": [0.4, 0.6], "radius": 0.004, "falloff": 300}
+    made = moving((11, 11), [push], tissue=LOCKS, fixed="border", time={"motion": "quasistatic", "precision": "auto"})
+    plan, dome = plan_of(made), curved(made, {"dome": {"radius": 0.04}})
+    loads = frame_loads(plan, 1)
+    u = reference.equilibrium(plan, loads, np.zeros((11, 11, 3)), assembled=dome)
+    # Where the slope of the foundation's law has grown to at least 4, half of the depth that locks.
+    assert -(u * dome.normal).sum(axis=-1).min() > 0.0015
+    assert reference.residual(made, u, loads, ~plan.fixed, dome) < 1e-12

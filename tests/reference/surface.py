@@ -41,7 +41,7 @@ class Cells(NamedTuple):
     @property
     def clamped(self) -> NDArray[np.bool_]:
         """Whether a spring constant of each cell has been set to 0."""
-        return (self.unclamped < 0).any(axis=-1)
+        return np.asarray((self.unclamped < 0).any(axis=-1))
 
 
 def _get(section: Any, name: str, default: Any = None) -> Any:
