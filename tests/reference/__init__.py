@@ -9,6 +9,7 @@ from tests.reference.dynamics import displacements as displacements
 from tests.reference.dynamics import elastic_force as elastic_force
 from tests.reference.dynamics import energy as energy
 from tests.reference.dynamics import force as force
+from tests.reference.dynamics import foundation_force as foundation_force
 from tests.reference.dynamics import longest_spring as longest_spring
 from tests.reference.dynamics import shortest_spring as shortest_spring
 from tests.reference.dynamics import simulate as simulate
@@ -19,5 +20,6 @@ from tests.reference.rest import clearance as clearance
 from tests.reference.rest import equilibrium as equilibrium
 from tests.reference.rest import equilibrium_outside_tool as equilibrium_outside_tool
 from tests.reference.rest import potential as potential
+from tests.reference.rest import residual as residual
 from tests.reference.rest import stiffness as stiffness
 from tests.reference.sheet import sheet as sheet

@@ -6,11 +6,34 @@ import numpy as np
 from numpy.typing import NDArray
 
 from taichi_msm.model.plan import Plan
-from taichi_msm.model.sheet import rest_positions
-from taichi_msm.model.tools import SolidTool, solid_tools
-from tests.reference.sheet import sheet
+from taichi_msm.model.tools import SolidTool, Tool, solid_tools
+from taichi_msm.scene.scene import Scene
+from tests.reference.sheet import Sheet, sheet
+from tests.reference.surface import at_fractions, normal_at
 
 Array = NDArray[np.float64]
+
+
+def lowest_point(scene: Scene, tool: SolidTool, time: float, assembled: Sheet) -> tuple[Array, Array]:
+    """Return the tip X + height N of a tool over a surface [m], and the normal N there; shape (3,) each.
+
+    Across, down and height are linear between keys, so a tool that is dragged follows the surface.
+    """
+    path = scene.probes[tool.probe].path
+    assert path is not None
+    keys = np.array(path, dtype=float)
+    across, down, height = (float(np.interp(time, keys[:, 0], keys[:, 1 + k])) for k in range(3))
+    normal = normal_at(assembled.normal, across, down)
+    return at_fractions(assembled.rest, across, down) + height * normal, normal
+
+
+def centre(scene: Scene, tool: Tool, time: float, assembled: Sheet) -> Array:
+    """Return the place c of a tool's axis at its tip at a time [m], shape (3,): X + (height + tip) N."""
+    if not assembled.is_curved or not isinstance(tool, SolidTool):
+        return tool.path_at(np.array([time]))[0]
+    lowest, normal = lowest_point(scene, tool, time, assembled)
+    across = np.linalg.norm(tool.axis - tool.axis @ normal * normal)
+    return lowest + tool.radius * (1 if tool.shape.is_round else across) * normal
 
 
 class Contact:
@@ -22,9 +45,9 @@ class Contact:
         holder: index of the probe that grips each mass point, or -1, shape (rows, cols).
     """
 
-    def __init__(self, plan: Plan) -> None:
-        self._plan, self._rest = plan, rest_positions(plan.scene.sheet)
-        self._mass = sheet(plan.scene).mass
+    def __init__(self, plan: Plan, assembled: Sheet | None = None) -> None:
+        self._plan, self._sheet = plan, assembled or sheet(plan.scene)
+        self._rest, self._mass = self._sheet.rest, self._sheet.mass
         shape = plan.scene.sheet.points
         self.push = np.zeros((len(plan.scene.probes), *shape, 3))
         self.force = np.zeros_like(self.push)
@@ -59,7 +82,7 @@ class Contact:
             holder = self.holder[i, j]
             for tool in plan.tools:
                 index = tool.probe
-                before, after = (tool.path_at(np.array([step / grid.steps_per_second]))[0] for step in (n, n + 1))
+                before, after = (self._centre(tool, step / grid.steps_per_second) for step in (n, n + 1))
                 push = np.zeros(3)
                 if holder == index and index in self._clamps:
                     keys = np.array(plan.scene.probes[index].path)
@@ -103,10 +126,13 @@ class Contact:
                 self.holder[self.holder == probe] = -1
         for tool in tools:
             if tool.probe in begun:
-                centre = tool.path_at(np.array([t]))[0]
-                near = np.linalg.norm(self._rest + u - centre, axis=-1) <= 1.5 * tool.radius
+                middle = self._centre(tool, t)
+                near = np.linalg.norm(self._rest + u - middle, axis=-1) <= 1.5 * tool.radius
                 gripped = near & ~plan.fixed & (self.holder < 0)
                 self.holder[gripped] = tool.probe
                 self._grip_displacement[gripped] = u[gripped]
-                self._grip_centre[tool.probe] = centre
+                self._grip_centre[tool.probe] = middle
         self._grip = grips
+
+    def _centre(self, tool: Tool, time: float) -> Array:
+        return centre(self._plan.scene, tool, time, self._sheet)

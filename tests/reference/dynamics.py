@@ -14,12 +14,15 @@ from numpy.typing import NDArray
 
 from taichi_msm.model.loads import Schedule, average_loads
 from taichi_msm.model.plan import Plan
-from taichi_msm.model.sheet import rest_positions, spacing
+from taichi_msm.model.sheet import spacing
 from taichi_msm.scene.scene import Scene
 from taichi_msm.scene.sheet import Foundation
+from taichi_msm.scene.tools import Probe
 from taichi_msm.solver.planning import make_plan
 from tests.reference.contact import Contact
+from tests.reference.loads import Loads, step_loads
 from tests.reference.sheet import Sheet, Springs, sheet
+from tests.reference.surface import at_fractions, normal_at
 
 Array = NDArray[np.float64]
 
@@ -38,18 +41,24 @@ def elastic_force(scene: Scene, displacement: Array, assembled: Sheet | None = N
     every = (assembled or sheet(scene)).springs
     force = np.zeros(displacement.shape, np.result_type(displacement, *(springs.unstretched for springs in every)))
     for springs in every:
-        between, length = _ends_apart(springs, displacement)
-        pull = (length - springs.unstretched) / np.where(length == 0, 1, length)
-        tension = (springs.stiffness * pull)[..., None] * between
-        at_rest = springs.stiffness * (springs.length - springs.unstretched) / springs.length
-        tension -= at_rest[..., None] * springs.offset
-        if scene.tissue is not None and scene.tissue.stiffening is not None:
-            keys, strain = scene.tissue.stiffening, length / springs.length - 1
-            more = springs.stiffness * springs.length * (lock(strain, keys.lock, keys.factor) - strain)
-            tension += (more / length)[..., None] * between
+        tension = spring_pull(scene, springs, displacement)
         force[springs.start] += tension
         force[springs.end] -= tension
     return force
+
+
+def spring_pull(scene: Scene, springs: Springs, displacement: Array) -> Array:
+    """Return the pull of springs on the mass points at their starts, less that at rest [N], shape (..., 3)."""
+    between, length = _ends_apart(springs, displacement)
+    pull = (length - springs.unstretched) / np.where(length == 0, 1, length)
+    tension = (springs.stiffness * pull)[..., None] * between
+    at_rest = springs.stiffness * (springs.length - springs.unstretched) / springs.length
+    tension -= at_rest[..., None] * springs.offset
+    if scene.tissue is not None and scene.tissue.stiffening is not None:
+        keys, strain = scene.tissue.stiffening, length / springs.length - 1
+        more = springs.stiffness * springs.length * (lock(strain, keys.lock, keys.factor) - strain)
+        tension += (more / length)[..., None] * between
+    return np.asarray(tension)
 
 
 def lock(e: Array, m: float, factor: float) -> Array:
@@ -68,7 +77,12 @@ def lock(e: Array, m: float, factor: float) -> Array:
     return np.where(e > c, c / (1 - c / m) + (e - c) * factor, curved)
 
 
-def _integral(e: Array, m: float, factor: float) -> Array:
+def lock_slope(e: Array, m: float, factor: float) -> Array:
+    """Return the slope of `lock`: 1 where e <= 0, then (1 - e / m)^-2, at most the factor."""
+    return np.where(e > m * (1 - factor**-0.5), factor, (1 - np.clip(e, 0, m * (1 - factor**-0.5)) / m) ** -2)
+
+
+def lock_energy(e: Array, m: float, factor: float) -> Array:
     """Return the integral of lock(e) - e from 0."""
     c = m * (1 - factor**-0.5)
     inner, beyond = np.clip(e, 0, c), np.maximum(e - c, 0)
@@ -79,19 +93,21 @@ def _integral(e: Array, m: float, factor: float) -> Array:
 def foundation_force(scene: Scene, displacement: Array, assembled: Sheet | None = None) -> Array:
     """Return the force of the virtual springs while they are active [N], shape (rows, cols, 3).
 
-    -K u (eq. 4), with `lock` of the depth -u_z where the foundation locks.
+    -K u (eq. 4); where the foundation locks, with `lock` of the depth along the normal at rest, w = -u . N.
 
     Args:
         scene: scene with virtual springs or a foundation.
         displacement: u [m], shape (rows, cols, 3).
         assembled: another sheet than the scene's.
     """
-    k = (assembled or sheet(scene)).virtual
+    assembled = assembled or sheet(scene)
+    k, normal = assembled.virtual, assembled.normal
     force = -k[..., None] * displacement
     foundation = None if scene.tissue is None else scene.tissue.foundation
     if isinstance(foundation, Foundation) and foundation.lock is not None:
-        depth = -displacement[..., 2]
-        force[..., 2] = k * np.where(depth > 0, lock(depth, foundation.lock, foundation.factor), depth)
+        depth = -(displacement * normal).sum(axis=-1)
+        more = np.where(depth > 0, lock(depth, foundation.lock, foundation.factor) - depth, 0)
+        force += (k * more)[..., None] * normal
     return force
 
 
@@ -117,7 +133,10 @@ def bending_force(scene: Scene, displacement: Array, assembled: Sheet | None = N
         displacement: u [m], shape (rows, cols, 3), real or complex.
         assembled: another sheet than the scene's.
     """
-    (dx, dy), moment = spacing(scene.sheet), (assembled or sheet(scene)).bending * _laplacian(scene, displacement)
+    assembled = assembled or sheet(scene)
+    if assembled.is_curved:
+        return np.zeros_like(displacement)
+    (dx, dy), moment = spacing(scene.sheet), assembled.bending * _laplacian(scene, displacement)
     force = np.zeros(displacement.shape, moment.dtype)
     force[1:-1, 1:-1] += (2 / dx**2 + 2 / dy**2) * moment
     force[1:-1, 2:] -= moment / dx**2
@@ -152,7 +171,7 @@ def _strains(scene: Scene, displacement: Array) -> Iterator[Array]:
         yield (_ends_apart(springs, displacement)[1] / springs.length)[springs.stiffness > 0]
 
 
-def energy(scene: Scene, displacement: Array) -> float:
+def energy(scene: Scene, displacement: Array, assembled: Sheet | None = None) -> float:
     """Return the elastic energy of springs and bending above that at rest [J], without the virtual springs.
 
     The sum of k ((L - L0)^2 - (L_rest - L0)^2) / 2, less the part linear in u, and of D / 2 |Laplacian|^2 dx dy.
@@ -160,48 +179,73 @@ def energy(scene: Scene, displacement: Array) -> float:
     Args:
         scene: scene with springs or tissue.
         displacement: u [m], shape (rows, cols, 3).
+        assembled: another sheet than the scene's.
     """
-    assembled = sheet(scene)
-    total = assembled.bending / 2 * float((_laplacian(scene, displacement) ** 2).sum())
+    assembled, total = assembled or sheet(scene), 0.0
+    if not assembled.is_curved:
+        total = assembled.bending / 2 * float((_laplacian(scene, displacement) ** 2).sum())
     for springs in assembled.springs:
         between, length = _ends_apart(springs, displacement)
         rest = springs.length - springs.unstretched
         # The part that is linear in the displacements cancels in the sum, as the sheet is in equilibrium at rest.
-        linear = (between - springs.offset) @ springs.offset * rest / springs.length
+        linear = ((between - springs.offset) * springs.offset).sum(axis=-1) * rest / springs.length
         strained = (length - springs.unstretched) ** 2 / 2 - rest**2 / 2 - linear
         total += float((springs.stiffness * strained).sum())
         if scene.tissue is not None and scene.tissue.stiffening is not None:
             keys, strain = scene.tissue.stiffening, length / springs.length - 1
-            total += float((springs.stiffness * springs.length**2 * _integral(strain, keys.lock, keys.factor)).sum())
+            total += float((springs.stiffness * springs.length**2 * lock_energy(strain, keys.lock, keys.factor)).sum())
     return total
 
 
-def surgical_force(scene: Scene, loads: Schedule, n: int, assembled: Sheet | None = None) -> Array:
+def surgical_force(scene: Scene, loads: Schedule | Loads, n: int, assembled: Sheet | None = None) -> Array:
     """Return the sum of the forces of probes [N], shape (rows, cols, 3).
 
     Of each, (percent / 100) force exp(-falloff d - offset) (eq. 5), or its total shared by exp(-falloff d).
 
     Args:
         scene: scene with force-controlled tools.
-        loads: schedule of loads and control points, a row for every step or time.
+        loads: schedule of loads and control points, a row for every step or time; for a surface `Loads`.
         n: row of the schedule.
         assembled: another sheet than the scene's.
     """
-    rest = rest_positions(scene.sheet)
-    force = np.zeros_like(rest)
+    assembled = assembled or sheet(scene)
+    force = np.zeros_like(assembled.rest)
+    if isinstance(loads, Loads):
+        for number, percent, (across, down) in zip(loads.probes, loads.percent[n], loads.at[n], strict=True):
+            force += percent / 100 * probe_force(scene.probes[number], assembled, across, down)
+        return force
     for index, slot in enumerate(loads.slots):
         probe = scene.probes[slot.probe]
-        distance = np.linalg.norm(rest[..., :2] - loads.point[n, index], axis=-1)
+        distance = np.linalg.norm(assembled.rest[..., :2] - loads.point[n, index], axis=-1)
         decay = np.exp(-probe.falloff * np.maximum(distance - probe.radius, 0))
         if probe.total is None:
             decay *= np.exp(-probe.offset)
         else:
-            decay *= (assembled or sheet(scene)).share
+            decay *= assembled.share
         force += decay[..., None] * loads.strength[n, index]
     return force
 
 
-def force(scene: Scene, displacement: Array, loads: Schedule, n: int, assembled: Sheet | None = None) -> Array:
+def probe_force(probe: Probe, assembled: Sheet, across: float, down: float) -> Array:
+    """Return the force of a probe at 100 % with its control point at fractions of the sheet [N], shape (rows, cols, 3).
+
+    force w(d) exp(-offset), or total w(d) A / W on a mass point of area A at the distance d in space, with
+    w = exp(-falloff max(d - R, 0)) and W its integral over a plane. A number acts along the normal.
+    """
+    distance = np.linalg.norm(assembled.rest - at_fractions(assembled.rest, across, down), axis=-1)
+    decay = np.exp(-probe.falloff * np.maximum(distance - probe.radius, 0))
+    if probe.total is None:
+        vector: Any = probe.force
+        decay *= np.exp(-probe.offset)
+    else:
+        vector, reach = probe.total, 1 / probe.falloff
+        decay *= assembled.area / (np.pi * probe.radius**2 + 2 * np.pi * (probe.radius * reach + reach**2))
+    if np.ndim(vector) == 0:
+        vector = vector * normal_at(assembled.normal, across, down)
+    return decay[..., None] * vector
+
+
+def force(scene: Scene, displacement: Array, loads: Schedule | Loads, n: int, assembled: Sheet | None = None) -> Array:
     """Return the sum of all forces except damping (eq. 1) [N], shape (rows, cols, 3).
 
     Args:
@@ -221,7 +265,7 @@ def force(scene: Scene, displacement: Array, loads: Schedule, n: int, assembled:
     )
 
 
-def internal_force(scene: Scene, displacement: Array, loads: Schedule, n: int, assembled: Sheet) -> Array:
+def internal_force(scene: Scene, displacement: Array, loads: Schedule | Loads, n: int, assembled: Sheet) -> Array:
     """Return the sum of the forces of springs, bending and foundation [N], shape (rows, cols, 3).
 
     Args:
@@ -268,8 +312,8 @@ def tangent(
 ) -> Array:
     """Return the change of springs', bending and foundation forces with the displacements [N], shape (rows, cols, 3).
 
-    Of a spring with the unit vector n, k ((1 - L0 / L) I + L0 / L n n^T) times the change of its vector; of laws that
-    lock, the linear part alone.
+    Of a spring with the unit vector n, k ((1 - L0 / L) I + L0 / L n n^T) times the change of its vector. With a pull
+    f(L) of stiffening tissue in addition, f / L (I - n n^T) + f' n n^T more.
 
     Args:
         scene: scene with springs or tissue.
@@ -280,11 +324,21 @@ def tangent(
     """
     assembled = assembled or sheet(scene)
     total = bending_force(scene, change, assembled) - active * assembled.virtual[..., None] * change
+    foundation = None if scene.tissue is None else scene.tissue.foundation
+    if isinstance(foundation, Foundation) and foundation.lock is not None:
+        depth, normal = -(displacement * assembled.normal).sum(axis=-1), assembled.normal
+        more = assembled.virtual * (lock_slope(depth, foundation.lock, foundation.factor) - 1)
+        total -= active * (more * (change * normal).sum(axis=-1))[..., None] * normal
     for springs in assembled.springs:
         between, length = _ends_apart(springs, displacement)
         apart, slack = change[springs.end] - change[springs.start], (springs.unstretched / length)[..., None]
         along = ((between * apart).sum(axis=-1) / length**2)[..., None] * between
         pull = springs.stiffness[..., None] * ((1 - slack) * apart + slack * along)
+        if scene.tissue is not None and scene.tissue.stiffening is not None:
+            keys, strain = scene.tissue.stiffening, length / springs.length - 1
+            more = springs.stiffness * springs.length / length * (lock(strain, keys.lock, keys.factor) - strain)
+            slope = springs.stiffness * (lock_slope(strain, keys.lock, keys.factor) - 1)
+            pull += more[..., None] * (apart - along) + slope[..., None] * along
         total[springs.start] += pull
         total[springs.end] -= pull
     return total
@@ -309,8 +363,9 @@ def steps(plan: Plan, assembled: Sheet | None = None) -> Iterator[tuple[Array, C
     scene = plan.scene
     h, assembled = plan.grid.step, assembled or sheet(scene)
     m, g = assembled.mass[..., None], (assembled.drag / assembled.mass)[..., None]
-    moves, contact = ~plan.fixed[..., None], Contact(plan)
-    loads, relaxation = average_loads(plan, 0, plan.grid.steps), Relaxation(scene, h)
+    moves, contact = ~plan.fixed[..., None], Contact(plan, assembled)
+    loads: Schedule | Loads = step_loads(plan) if assembled.is_curved else average_loads(plan, 0, plan.grid.steps)
+    relaxation = Relaxation(scene, h)
 
     def acceleration(u: Array, n: int) -> Array:
         if scene.tissue is None or not scene.tissue.relaxation:
@@ -336,4 +391,4 @@ def simulate(scene: Scene) -> Array:
     """Return the positions of every frame of a scene [m], shape (frames + 1, rows, cols, 3)."""
     plan = make_plan(scene)
     frames = [u for n, u in enumerate(displacements(plan)) if n % plan.grid.steps_per_frame == 0]
-    return rest_positions(scene.sheet) + np.array(frames)
+    return sheet(scene).rest + np.array(frames)

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from taichi_msm.model.sheet import MapImage, cell_factors, point_factors, read_map, spacing
 from taichi_msm.scene.scene import Scene
 from taichi_msm.scene.sheet import StiffnessMap, Tissue
+from tests.reference import surface as curved
 
 Array = NDArray[np.float64]
 Window = tuple[slice, slice]
@@ -39,6 +40,10 @@ class Sheet(NamedTuple):
     virtual: Array  # K of every point [N/m], shape (rows, cols)
     bending: Any  # D dx dy [N m3]
     share: Array  # area of every point as a share of a cell's, shape (rows, cols)
+    rest: Array  # rest positions [m], shape (rows, cols, 3)
+    normal: Array  # unit normals at rest, shape (rows, cols, 3)
+    area: Array  # of every point [m2], shape (rows, cols)
+    is_curved: bool  # whether the sheet has a surface
 
 
 # Rows and columns from the start of a spring to its end.
@@ -71,16 +76,28 @@ def _read(stiffness_map: StiffnessMap, _changed: int) -> MapImage:
     return read_map(stiffness_map)
 
 
-def sheet(scene: Scene) -> Sheet:
-    """Assemble the sheet of a scene.
+def sheet(scene: Scene, rest: Array | None = None) -> Sheet:
+    """Assemble the sheet of a scene, flat or with its surface.
 
     Springs from `springs` have its constants; those of tissue are the ones of a cell dx by dy whose strain energy is
     that of an isotropic membrane with Poisson's ratio 1/3 (Lloyd et al. 2007), half of each edge's from the cell at
     either side. Masses and virtual springs of tissue are shares of the cells' area.
+
+    Args:
+        scene: scene with springs or tissue.
+        rest: rest positions [m], shape (rows, cols, 3), in place of those of the scene.
     """
-    rows, cols = scene.sheet.points
+    surface = getattr(scene.sheet, "surface", None)
+    if rest is None and surface is not None:
+        rest = curved.rest_positions(surface, scene.sheet.points, scene.sheet.size)
+    if rest is not None:
+        return _curved(scene, rest)
     if scene.tissue is not None:
         return _of_tissue(scene, scene.tissue)
+    return _of_springs(scene, curved.flat_positions(scene.sheet.points, scene.sheet.size), is_curved=False)
+
+
+def _of_springs(scene: Scene, rest: Array, *, is_curved: bool) -> Sheet:
     assert scene.springs is not None
     factor = _factors(scene)
     cells = np.ones_like(factor)
@@ -91,11 +108,84 @@ def sheet(scene: Scene) -> Sheet:
         TO_RIGHT: shear * factor,
         TO_LEFT: shear * factor,
     }
-    every = np.ones((rows, cols))
-    share = _rows_of(_columns_of(cells)) / 4
-    springs = tuple(_springs(scene, ahead, k, 0 * k) for ahead, k in stiffness.items())
-    mass, virtual = (scene.sheet.mass or 0.0) * every, scene.springs.virtual * every
-    return Sheet(springs, mass, scene.damping * every, virtual, 0.0, share)
+    every, measured = np.ones(scene.sheet.points), curved.cells(rest)
+    springs = tuple(
+        _springs_between(rest, ahead, k, 0 * k) if is_curved else _springs(scene, ahead, k, 0 * k)
+        for ahead, k in stiffness.items()
+    )
+    mass, virtual, drag = (scene.sheet.mass or 0.0) * every, scene.springs.virtual * every, scene.damping * every
+    area, share = curved.point_areas(measured), _rows_of(_columns_of(cells)) / 4
+    return Sheet(springs, mass, drag, virtual, 0.0, share, rest, curved.normals(measured), area, is_curved)
+
+
+def _curved(scene: Scene, rest: Array) -> Sheet:
+    """Assemble a sheet with given rest positions, without bending."""
+    tissue = scene.tissue
+    if tissue is None:
+        return _of_springs(scene, rest, is_curved=True)
+    measured, factor, membrane = curved.cells(rest), _factors(scene), tissue.young * tissue.thickness
+    area = curved.point_areas(measured)
+    stretch = tissue.pretension / (3 / 2 * membrane)
+    along_row, along_column, to_right, to_left = np.moveaxis(membrane * measured.constants, -1, 0)
+    families = {
+        ALONG_ROW: (_rows_of(factor * along_row), _rows_of(along_row)),
+        ALONG_COLUMN: (_columns_of(factor * along_column), _columns_of(along_column)),
+        TO_RIGHT: (factor * to_right, to_right),
+        TO_LEFT: (factor * to_left, to_left),
+    }
+    springs = []
+    for ahead, (k, k1) in families.items():
+        start, end = _windows(scene.sheet.points, ahead)
+        square = ((rest[end] - rest[start]) ** 2).sum(axis=-1)
+        springs.append(_springs_between(rest, ahead, square * k, stretch * square * k1))
+    mass = (tissue.density or 0.0) * tissue.thickness * area
+    virtual = tissue.foundation_stiffness * area * _foundation_factors(scene)
+    share = _rows_of(_columns_of(np.ones_like(factor))) / 4
+    drag, normal = tissue.damping * mass, curved.normals(measured)
+    return Sheet(tuple(springs), mass, drag, virtual, 0.0, share, rest, normal, area, is_curved=True)
+
+
+def cell_stiffness(scene: Scene, rest: Array) -> Array:
+    """Return the spring constants of tissue in each cell over length^2 [N/m3], shape (rows - 1, cols - 1, 4)."""
+    assert scene.tissue is not None
+    return scene.tissue.young * scene.tissue.thickness * _factors(scene)[..., None] * curved.cells(rest).constants
+
+
+def highest_frequency(scene: Scene, rest: Array | None = None) -> float:
+    """Return the bound of the angular frequencies from which the largest step follows [rad/s].
+
+    w^2 = max over the points of (factor sum of Lam of its cells + factor_K K) / m, Lam by `stiffness_bounds`; with
+    `springs` (max(8 structural, 4 structural + 8 shear) + K) / m, with the largest factor of a map around a point.
+    """
+    assembled, tissue = sheet(scene, rest), scene.tissue
+    if tissue is None:
+        assert scene.springs is not None
+        structural, shear, factor = scene.springs.structural, scene.springs.shear, _factors(scene)
+        around = curved.sum_at_corners(factor) / curved.sum_at_corners(np.ones_like(factor))
+        springs = max(8 * structural, 4 * structural + 8 * shear) * around
+        return math.sqrt(float(((springs + assembled.virtual) / assembled.mass).max()))
+    stiffening, foundation = tissue.stiffening, getattr(tissue.foundation, "lock", None)
+    of_springs = 1.0 if stiffening is None else stiffening.factor
+    of_foundation = 1.0 if foundation is None else tissue.foundation.factor  # type: ignore[union-attr]
+    bounds = curved.stiffness_bounds(assembled.rest, cell_stiffness(scene, assembled.rest))
+    total = of_springs * curved.sum_at_corners(bounds) + of_foundation * assembled.virtual
+    return math.sqrt(float((total / assembled.mass).max()))
+
+
+def largest_pressure(assembled: Sheet, free: NDArray[np.bool_]) -> float:
+    """Return the largest pressure that the pretension needs in equilibrium, |N . sum of tau o| / area [Pa].
+
+    Args:
+        assembled: assembled sheet.
+        free: whether a mass point is neither fixed nor clamped, shape (rows, cols).
+    """
+    force = np.zeros_like(assembled.rest)
+    for springs in assembled.springs:
+        tau = springs.stiffness * (springs.length - springs.unstretched) / springs.length
+        force[springs.start] += tau[..., None] * springs.offset
+        force[springs.end] -= tau[..., None] * springs.offset
+    pressure = np.abs((force * assembled.normal).sum(axis=-1)) / assembled.area
+    return float(pressure[free].max())
 
 
 def _of_tissue(scene: Scene, tissue: Tissue) -> Sheet:
@@ -117,7 +207,11 @@ def _of_tissue(scene: Scene, tissue: Tissue) -> Sheet:
     plate = tissue.young * tissue.thickness**3 / 12 / (1 - 1 / 9)
     bending = plate if tissue.bending == "plate" else tissue.bending
     virtual = tissue.foundation_stiffness * dx * dy / 4 * quarters * _foundation_factors(scene)
-    return Sheet(springs, mass, tissue.damping * mass, virtual, bending * dx * dy, quarters / 4)
+    rest = curved.flat_positions(scene.sheet.points, scene.sheet.size)
+    normal = np.zeros_like(rest)
+    normal[..., 2] = 1
+    drag, area = tissue.damping * mass, dx * dy * quarters / 4
+    return Sheet(springs, mass, drag, virtual, bending * dx * dy, quarters / 4, rest, normal, area, is_curved=False)
 
 
 def _rows_of(cells: Array) -> Array:
@@ -130,12 +224,27 @@ def _columns_of(cells: Array) -> Array:
     return np.pad(cells, ((0, 0), (0, 1))) + np.pad(cells, ((0, 0), (1, 0)))
 
 
+def _windows(points: tuple[int, int], ahead: tuple[int, int]) -> tuple[Window, Window]:
+    (rows, cols), (down, right) = points, ahead
+    start = slice(0, rows - down), slice(max(0, -right), cols - max(0, right))
+    return start, (slice(down, rows), slice(max(0, right), cols - max(0, -right)))
+
+
 def _springs(scene: Scene, ahead: tuple[int, int], stiffness: Array, pull: Array) -> Springs:
     """Build the springs `ahead` rows and columns long; `pull` is their force at rest over their length [N/m]."""
     (down, right), (dx, dy) = ahead, spacing(scene.sheet)
-    rows, cols = scene.sheet.points
-    start = slice(0, rows - down), slice(max(0, -right), cols - max(0, right))
-    end = slice(down, rows), slice(max(0, right), cols - max(0, -right))
     length = math.hypot(right * dx, down * dy)
+    offset = np.array([right * dx, -down * dy, 0.0])
+    return _with_pull(*_windows(scene.sheet.points, ahead), offset, length, stiffness, pull)
+
+
+def _springs_between(rest: Array, ahead: tuple[int, int], stiffness: Array, pull: Array) -> Springs:
+    """Build the springs `ahead` rows and columns long between rest positions, shape (rows, cols, 3)."""
+    start, end = _windows((rest.shape[0], rest.shape[1]), ahead)
+    offset = rest[end] - rest[start]
+    return _with_pull(start, end, offset, np.linalg.norm(offset, axis=-1), stiffness, pull)
+
+
+def _with_pull(start: Window, end: Window, offset: Array, length: Any, stiffness: Array, pull: Array) -> Springs:
     shorter = np.divide(pull * length, stiffness, out=np.zeros_like(pull), where=stiffness.real > 0)
-    return Springs(start, end, np.array([right * dx, -down * dy, 0.0]), length, stiffness, length - shorter)
+    return Springs(start, end, offset, length, stiffness, length - shorter)
