@@ -197,8 +197,9 @@ class FitResult:
             residual = (
                 f"{fitted.residual:.3g} N, {rounded(100 * fitted.residual / peak)} % of the peak, at {frames} frames"
             )
-            offset = f"offset {fitted.loading.offset:.3g} +- {rounded(fitted.offset_error)} N"
-            details = f"noise {fitted.loading.noise:.2g} N, {offset}, contact at {fitted.contact:.4g} m"
+            noise = f"noise of the first {fitted.loading.test.noise_rows} rows {fitted.loading.noise:.2g} N"
+            offset = f"offset {fitted.loading.offset:.3g} +- {rounded(fitted.offset_error)} N subtracted"
+            details = f"{noise}, {offset}, contact at {1000 * fitted.contact:.4g} mm"
             lines.append(f"{fitted.loading.test.name}: residual {residual}; {details}{chi_text}")
         if not self.tests:
             pairs = zip(self.observations, self.fitted, strict=True)
