@@ -141,6 +141,7 @@ def test_links() -> None:
 def test_shown_files_are_the_shipped_ones() -> None:
     assert blocks(DOCS / "scene.md", "yaml") == [read(ROOT / "scenes" / "press.yaml")]
     assert blocks(DOCS / "sweep.md", "yaml") == [read(ROOT / "scenes" / "sweeps" / "stiffness.yaml")]
+    assert blocks(DOCS / "machine-tables.md", "yaml") == [read(ROOT / "examples" / "ball.yaml")]
     assert blocks(DOCS / "view.md", "yaml") == [read(ROOT / "scenes" / "scripts" / "press.yaml")]
 
 

@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 
 import taichi_msm
+from taichi_msm.machines.reader import read_machine_test
 from taichi_msm.runs.simulation import Simulation
 from taichi_msm.system.runtime import Device
 
@@ -39,6 +40,26 @@ def test_gymnasium_environment(device: Device, root: Path, monkeypatch: pytest.M
     assert rewards[-1] == pytest.approx(0.5 - info["force"])
     assert rewards[-1] > min(rewards) == rewards[0]
     environment.simulation.close()
+
+
+@pytest.mark.slow
+def test_table_of_a_ball(device: Device, root: Path) -> None:
+    """Its intervals contain the values of the script that made it, and the values of the scene that it kept."""
+    made = runpy.run_path(str(root / "examples" / "make_ball.py"))
+    truth = made["TRUTH"] | {
+        "tissue.relaxation.1.share": 0.2,
+        "tissue.relaxation.1.time": 4,
+        "contact": made["CONTACT"],
+    }
+    table = root / "examples" / "ball.csv"
+    noise = read_machine_test(table).force - made["OFFSET"] - made["forces"]()
+    assert noise.std() == pytest.approx(made["NOISE"], rel=0.2)  # of 281 numbers, 4.7 standard deviations
+    result = taichi_msm.fit(root / "examples" / "ball.yaml", table, list(truth), workers=1)
+    assert not result.model_rejected
+    for key, value in truth.items():
+        low, high = result.parameters[key].interval
+        assert low < value < high, key
+    assert abs(result.tests[0].loading.offset - made["OFFSET"]) < 3 * result.tests[0].offset_error
 
 
 @pytest.mark.slow

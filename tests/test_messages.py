@@ -141,6 +141,7 @@ WITHOUT_MESSAGES = {
     "cli/console.py",
     "exports/formats.py",
     "exports/obj.py",
+    "fitting/panels.py",
     "fitting/plots.py",
     "study/plot.py",
     "view/events.py",

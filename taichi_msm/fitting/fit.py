@@ -293,9 +293,9 @@ def uncertainty_notes(
     """
     half_widths = uncertainties.quantile * uncertainties.deviations
     if shifts is not None and (moved := np.flatnonzero(shifts > half_widths).tolist()):
-        shares = [(parameters[n].key, parameters[n].relative_error(x[n], float(shifts[n]))) for n in moved]
-        shifted_parameters = ", ".join(f"{key} by about {rounded(100 * share)} %" for key, share in shares)
-        yield f"the mesh changes {shifted_parameters}, more than the interval; take more sheet.points"
+        changes = [(parameters[n].key, parameters[n].format_error(x[n], float(shifts[n]))) for n in moved]
+        shown = ", ".join(f"{key} by about {change}" for key, change in changes)
+        yield f"the mesh changes {shown}, more than the interval; take more sheet.points"
     for n, m in zip(*np.nonzero(np.triu(np.abs(uncertainties.correlation) > MAX_CORRELATION, 1)), strict=True):
         keys = parameters[n].key, parameters[m].key
         if not any({*keys} <= {*group.parameters} for group in unidentified):

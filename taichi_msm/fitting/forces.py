@@ -9,6 +9,7 @@ import math
 import re
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any, ClassVar
 
@@ -17,7 +18,8 @@ from numpy.typing import NDArray
 
 from taichi_msm.errors import SceneError
 from taichi_msm.fitting import observation
-from taichi_msm.fitting.observation import Array, Observation, ObservationModel
+from taichi_msm.fitting.observation import Array, Observation, ObservationModel, root_mean_square
+from taichi_msm.fitting.panels import Panel, plot_forces
 from taichi_msm.machines.cells import Row, decimal_mark, read_text
 from taichi_msm.runs.simulation import Simulation
 from taichi_msm.scene.scene import Scene
@@ -50,7 +52,10 @@ class Forces(Observation):
         return float(np.mean(residuals**2)) <= limit
 
     def summary(self, residuals: Array, sigma: float | Array) -> dict[str, Any]:
-        return {"residual_force": float(np.sqrt(np.mean(residuals**2))), "sigma_force": float(np.mean(sigma))}
+        return {"residual_force": root_mean_square(residuals), "sigma_force": float(np.mean(sigma))}
+
+    def format_residual(self, residual: float) -> str:
+        return f"{residual:.3g} N"
 
     def factor_note(self, predicted: Array) -> str:
         """Return a clause with the ratio of measured to predicted forces, or an empty string."""
@@ -83,6 +88,9 @@ class ToolForces(Forces):
 
     def build_model(self, scene: Scene, frames: int) -> ForceModel:
         return ForceModel(scene, self, frames)
+
+    def panels(self, scene: Scene, fitted: Array) -> list[Panel]:
+        return [partial(plot_forces, time=self.time, probe=self.probe, fitted=fitted, observed=self.values)]
 
     def opposed(self, scene: Scene, *predictions: Array) -> Iterator[str]:
         for axis in observation.opposed_axes(self.values, predictions, self.sigma):

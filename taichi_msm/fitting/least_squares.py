@@ -15,7 +15,7 @@ import numpy as np
 
 from taichi_msm.errors import SceneError
 from taichi_msm.fitting.observation import Array, Observation
-from taichi_msm.fitting.predict import Prediction, Runs, difference_step
+from taichi_msm.fitting.predict import Prediction, Runs
 
 # Largest residual with almost full weight in robust fits, in sigma.
 OUTLIER_SIGMAS = 2.0
@@ -117,7 +117,7 @@ class Search:
 
     def __init__(self, runs: Runs, misfit: Misfit, limits: tuple[Array, Array] | None = None) -> None:
         self._runs, self.misfit = runs, misfit
-        self._delta = difference_step(runs.problem.scene)
+        self._delta = runs.problem.difference_step
         self._limits = limits or runs.problem.limits
         self._known: dict[bytes, Prediction | None] = {}
         self._neighbours: dict[bytes, Prediction | None] = {}

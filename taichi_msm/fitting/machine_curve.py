@@ -28,7 +28,7 @@ from taichi_msm.errors import DivergedError, SceneError, StageProgressCallback
 from taichi_msm.fitting.least_squares import Misfit, Scales, Search, Solution
 from taichi_msm.fitting.machine_model import MachineModel, MachineProblem
 from taichi_msm.fitting.observation import Array
-from taichi_msm.fitting.predict import FitProblem, Prediction, Runs, difference_step, mesh_error
+from taichi_msm.fitting.predict import FitProblem, Prediction, Runs, mesh_error
 from taichi_msm.load.check import check_scene
 from taichi_msm.model.plan import Plan
 from taichi_msm.scene.scene import Scene
@@ -163,7 +163,7 @@ class CurveRuns(Runs):
         reach = self._reach(values)
         forces, slopes = self._forces(values, reach), np.zeros((len(x), TRAVELS + 1))
         for n in np.flatnonzero(self.changes_curve):
-            shifted, delta = x.copy(), difference_step(self.problem.scene)
+            shifted, delta = x.copy(), self.problem.difference_step
             delta = delta if x[n] + delta <= self.problem.parameters[n].limits[1] else -delta
             shifted[n] += delta
             moved = self._forces(self._model.values(shifted), reach)

@@ -97,8 +97,7 @@ def contact_notes(
     half_widths = uncertainties.quantile * uncertainties.deviations
     moved = np.flatnonzero((errors[:count] > MAX_CONTACT_EFFECT * half_widths) & ~uncertainties.unidentified).tolist()
     if moved and slopes.shape[1]:
-        shares = [(parameters[n].key, parameters[n].relative_error(x[n], float(errors[n]))) for n in moved]
-        known = " and ".join(f"{key} to {rounded(100 * share)} %" for key, share in shares)
+        known = " and ".join(f"{parameters[n].key} to {parameters[n].format_error(x[n], errors[n])}" for n in moved)
         fault = f"the depth of contact, found from the noise, is known to {contact} mm, and {known}"
         yield f"{fault}, beyond the interval; take --free contact, or give an exact depth by --contact"
 
@@ -193,9 +192,10 @@ def _explain_by_another_contact(fitted: FittedTest, rising: slice) -> str:
     slack = ""
     if shift > 0 and coefficients[1] > CONTACT_NOISES * loading.noise:
         slack = f" after a slack with {coefficients[1]:.2g} N"
+    contact = f"{fitted.contact + shift:.4g}"
     return (
-        f"a contact at {fitted.contact + shift:.4g} m of the table, not {fitted.contact:.4g} m,{slack} explains "
-        f"{rounded(100 * explained)} % of the residual: give --contact, or --free contact"
+        f"a contact at {1000 * float(contact):g} mm of the table, not {1000 * fitted.contact:.4g} mm,{slack} explains "
+        f"{rounded(100 * explained)} % of the residual: give --contact {contact}, or --free contact"
     )
 
 

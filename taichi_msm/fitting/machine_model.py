@@ -13,6 +13,7 @@ import numpy as np
 from taichi_msm.errors import Pause, SceneError
 from taichi_msm.fitting.forces import Forces
 from taichi_msm.fitting.observation import Array, ObservationModel
+from taichi_msm.fitting.panels import Panel
 from taichi_msm.fitting.parameters import Bounds, Method, Parameter, as_data, make_parameters, with_values
 from taichi_msm.fitting.predict import FitProblem, ForwardModel, Prediction, without_outputs
 from taichi_msm.load.check import check_scene
@@ -73,6 +74,9 @@ class MachineForces(Forces, ObservationModel):
 
     def build_model(self, scene: Scene, frames: int) -> MachineForces:
         return self
+
+    def panels(self, scene: Scene, fitted: Array) -> list[Panel]:
+        return []  # Each test has its own.
 
     def record(self, simulation: Simulation) -> Array:
         """Return the force of the tool in the current frame [N], shape (3,)."""

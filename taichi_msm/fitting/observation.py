@@ -6,6 +6,7 @@ import math
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
@@ -13,6 +14,7 @@ from numpy.typing import NDArray
 from typing_extensions import Self
 
 from taichi_msm.errors import SceneError
+from taichi_msm.fitting.panels import Panel, plot_match
 from taichi_msm.runs.simulation import Simulation
 from taichi_msm.scene.scene import Scene
 from taichi_msm.scene.section import MAX_MAGNITUDE, MIN_MAGNITUDE
@@ -45,13 +47,13 @@ class ObservationModel(ABC):
         """Return the values of the observation; `recorded`: records of all frames, stacked."""
 
     def motion(self, recorded: Array) -> Array:
-        """Return the largest displacement of the observed points at each frame [m], shape (frames,)."""
-        return np.zeros(len(recorded))
+        """Return the largest displacement of the observed points at each frame [m], shape (frames,), NaN if unknown."""
+        return np.full(len(recorded), np.nan)
 
 
 @dataclass(frozen=True, eq=False)
 class Observation(ABC):
-    """Measured values of any shape.
+    """Measured values of any shape, with their components along the last axis.
 
     Attributes:
         noun: name of the values, for messages.
@@ -125,7 +127,27 @@ class Observation(ABC):
     def signal(self, scene: Scene) -> float:
         """Return the root mean square of the observed motion or forces [unit]."""
 
-    @abstractmethod
+    def difference_step(self, scene: Scene) -> float:
+        """Return the step of finite differences: a relative change of a parameter, or a share of its range.
+
+        Rounding errors e of the values [unit] require about sqrt(e / signal); by default they are those of f64.
+        Equilibria, solved to about 1e-6, and contacts, which change in jumps, require larger steps.
+        """
+        return 1e-2 if scene.time.at_rest or any(probe.moved for probe in scene.probes) else 1e-5
+
+    def panels(self, scene: Scene, fitted: Array) -> list[Panel]:
+        """Return the panels of fit.png, functions that plot on the given axes of Matplotlib.
+
+        Args:
+            scene: fitted scene.
+            fitted: values predicted by it, with the shape of `values`.
+        """
+        return [partial(plot_match, fitted=fitted[self.known], observed=self.values[self.known], unit=self.unit)]
+
+    def format_residual(self, residual: float) -> str:
+        """Format the root mean square of the residuals [unit], with the number of values."""
+        return f"{residual:.3g} {self.unit} of {self.known.sum()} {self.noun}"
+
     def fits_well(self, residuals: Array, deviation: float, signal: float) -> bool:
         """Return whether the residuals are small.
 
@@ -134,8 +156,10 @@ class Observation(ABC):
             deviation: standard deviation estimated from the residuals [unit].
             signal: root mean square from `signal` [unit].
         """
+        if self.sigma is None:
+            return deviation <= MAX_RESIDUAL_SHARE * signal
+        return deviation <= MAX_RESIDUAL_SIGMAS * float(np.mean(self.sigma))
 
-    @abstractmethod
     def summary(self, residuals: Array, sigma: float | Array) -> dict[str, Any]:
         """Return residual and sigma as fields of a `FitResult`, by name.
 
@@ -143,6 +167,7 @@ class Observation(ABC):
             residuals: predicted minus observed known values [unit], shape (known,).
             sigma: standard deviation of the errors [unit], given or estimated.
         """
+        return {"residual": root_mean_square(residuals), "sigma": float(np.mean(sigma)), "unit": self.unit}
 
     def faults(self, scene: Scene) -> Iterator[str]:
         """Yield the faults found without a run, such as wrong units and sentinel values."""
@@ -208,6 +233,11 @@ class Observation(ABC):
             correlation: given correlation of the errors.
         """
         yield from ()
+
+
+def root_mean_square(values: Array) -> float:
+    """Return the root mean square of values of any shape."""
+    return float(np.sqrt(np.mean(values**2)))
 
 
 def time_in_frames(scene: Scene, time: Array) -> Array:

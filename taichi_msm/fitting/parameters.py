@@ -86,6 +86,12 @@ class Parameter:
         unit = self.scale if _is_coordinate(self.path) else abs(self.value(x))
         return deviation * self.scale / unit if unit else math.inf
 
+    def format_error(self, x: float, deviation: float) -> str:
+        """Format the relative error in percent, that of a depth of contact in mm."""
+        if self.path[0] == "contact":
+            return f"{rounded(1000 * self.error(x, deviation))} mm"
+        return f"{rounded(100 * self.relative_error(x, deviation))} %"
+
 
 def make_parameters(scene: Scene, free: Sequence[str], bounds: Mapping[str, Bounds]) -> tuple[Parameter, ...]:
     """Return the parameters of a fit; raise a SceneError with all faults of keys and bounds."""

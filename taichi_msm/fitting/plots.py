@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import warnings
-from collections.abc import Callable
+from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
 from typing import BinaryIO
@@ -21,10 +21,9 @@ from matplotlib.ticker import LogLocator, MaxNLocator, NullFormatter, ScalarForm
 from numpy.typing import NDArray
 
 from taichi_msm.errors import printable
-from taichi_msm.fitting.forces import ToolForces
 from taichi_msm.fitting.machine_fit import FittedTest
-from taichi_msm.fitting.observation import Array, Observation
-from taichi_msm.fitting.points import PointObservation
+from taichi_msm.fitting.observation import Array
+from taichi_msm.fitting.panels import Panel
 from taichi_msm.fitting.result import FitResult, FittedMap
 from taichi_msm.fitting.tikhonov import SmoothnessWeight
 from taichi_msm.plot_style import BLUE, DPI, GREY, ORANGE, SILVER, STYLE, TWO_COLUMN_WIDTH, VERMILION
@@ -33,9 +32,6 @@ from taichi_msm.scene.sheet import Sheet
 COLUMN_COUNT = 3
 
 DASHED = (0, (4, 2))
-
-# Function that plots a panel.
-Panel = Callable[[Axes], None]
 
 
 def plot(result: FitResult, file: BinaryIO) -> None:
@@ -51,7 +47,8 @@ def plot(result: FitResult, file: BinaryIO) -> None:
 def _figure(result: FitResult) -> Figure:
     panels = [] if result.map is None else _map_panels(result.map, result.scene.sheet)
     for observed, fitted in zip(result.observations, result.fitted, strict=True):
-        panels += observation_panels(observed, fitted, result)
+        panels += observed.panels(result.scene, fitted)
+    panels += _test_panels(result.tests)
     panels += [partial(_plot_parameter, result=result, key=key) for key in result.parameters]
     rows = math.ceil(len(panels) / COLUMN_COUNT)
     engine = ConstrainedLayoutEngine(w_pad=0.1, h_pad=0.1)
@@ -66,88 +63,16 @@ def _figure(result: FitResult) -> Figure:
     return figure
 
 
-def observation_panels(observed: Observation, fitted: Array, result: FitResult) -> list[Panel]:
-    """Return the panels of an observation; `fitted`: its values in the fitted scene."""
-    if isinstance(observed, PointObservation):
-        point_count, time_count = (int(observed.is_observed.any(axis=axis).sum()) for axis in (1, 0))
-        # A single time shows no motion, a single point no map of residuals.
-        panels = [_plot_motion, _plot_match] * (time_count > 1)
-        panels += [partial(_plot_residuals, sheet=result.scene.sheet)] * (point_count > 1)
-        return [partial(panel, observed=observed, fitted=fitted) for panel in panels]
-    if isinstance(observed, ToolForces):
-        return [partial(_plot_forces, observed=observed, fitted=fitted)]
+def _test_panels(tests: Sequence[FittedTest]) -> list[Panel]:
+    """Return the panels of machine tests: force over time and over depth, and the residual."""
     # The file of a single test is in the title of the figure.
-    titles = [printable(Path(test.loading.test.name).name) for test in result.tests]
-    test_panels: list[Panel] = []
-    for test, title in zip(result.tests, titles if len(titles) != 1 else ["Force over time"], strict=True):
-        test_panels.append(partial(_plot_test_over_time, fitted=test, title=title))
-        test_panels.append(partial(_plot_test_over_depth, fitted=test))
-        test_panels.append(partial(_plot_test_residual, fitted=test))
-    return test_panels
-
-
-def _plotted_unit(observed: PointObservation) -> tuple[float, str]:
-    """Return the factor from the unit of the values to the plotted one, and its name."""
-    return (1000.0, "mm") if observed.unit == "m" else (1.0, "px")
-
-
-def _plot_motion(axes: Axes, observed: PointObservation, fitted: Array) -> None:
-    """Plot the three points of largest motion over time, along their principal direction."""
-    scale, unit = _plotted_unit(observed)
-    order, centre = np.argsort(observed.time), np.nanmean(fitted, axis=1, keepdims=True)
-    motion = np.nan_to_num(fitted - centre)
-    for n in np.argsort(-np.linalg.norm(motion, axis=(1, 2)))[:3]:
-        along = np.linalg.svd(motion[n], full_matrices=False).Vh[0]
-        along = along if along[np.argmax(np.abs(along))] > 0 else -along
-        line, points = (scale * (values[n] - centre[n]) @ along for values in (fitted, observed.values))
-        _plot_over_time(axes, observed.time[order], line[order], points[order])
-    axes.set(title="The points that move most", xlabel="time [s]", ylabel=f"place along the motion [{unit}]")
-    axes.legend()
-
-
-def _plot_over_time(axes: Axes, time: Array, fitted: Array, observed: Array) -> None:
-    """Plot a fitted line and observed dots, with labels for the first line of the panel."""
-    labels = (None, None) if axes.lines else ("fitted", "observed")
-    axes.plot(time, fitted, color=BLUE, label=labels[0])
-    axes.plot(time, observed, ".", color=VERMILION, markersize=3, label=labels[1])
-
-
-def _plot_match(axes: Axes, observed: PointObservation, fitted: Array) -> None:
-    """Plot observed against fitted values, both relative to the mean fitted position."""
-    scale, unit = _plotted_unit(observed)
-    centre = np.nanmean(fitted, axis=1, keepdims=True)
-    x, y = (scale * (values - centre)[observed.known] for values in (fitted, observed.values))
-    # At most 20000 dots are drawn.
-    subset = slice(None, None, math.ceil(len(x) / 20000))
-    axes.scatter(x[subset], y[subset], 2, color=BLUE, alpha=0.4, linewidths=0)
-    ends = [float(x.min()), float(x.max())]
-    axes.plot(ends, ends, color=GREY, linewidth=0.8)
-    axes.set(title="Observed against fitted", xlabel=f"fitted, from the mean [{unit}]", ylabel=f"observed [{unit}]")
-
-
-def _plot_residuals(axes: Axes, observed: PointObservation, fitted: Array, sheet: Sheet) -> None:
-    scale, unit = _plotted_unit(observed)
-    residuals = scale * np.sqrt(np.nanmean((fitted - observed.values) ** 2, axis=(1, 2)))
-    across, down = observed.coordinates.T
-    dots = axes.scatter(across, down, 14, c=residuals, cmap="viridis", vmin=0)
-    height, width = sheet.size
-    axes.set(title="Residual", xlim=(0, 1), ylim=(1, 0), xlabel="across", ylabel="down", aspect=height / width)
-    assert isinstance(axes.figure, Figure)
-    axes.figure.colorbar(dots, ax=axes, label=f"root mean square [{unit}]", shrink=0.8)
-
-
-def _plot_forces(axes: Axes, observed: ToolForces, fitted: Array) -> None:
-    for probe in np.unique(observed.probe):
-        rows = np.flatnonzero(observed.probe == probe)
-        rows = rows[np.argsort(observed.time[rows])]
-        for component in np.flatnonzero(np.isfinite(observed.values[rows]).any(axis=0)):
-            line = fitted[rows, component]
-            _plot_over_time(axes, observed.time[rows], line, observed.values[rows, component])
-            largest = np.argmax(np.abs(line))
-            if abs(line[largest]) > 0.1 * np.abs(fitted).max():
-                axes.text(observed.time[rows[largest]], line[largest], f"  {'xyz'[component]}")
-    axes.set(title="Forces on the sheet", xlabel="time [s]", ylabel="force [N]")
-    axes.legend()
+    titles = [printable(Path(test.loading.test.name).name) for test in tests] if len(tests) > 1 else ["Force over time"]
+    panels: list[Panel] = []
+    for test, title in zip(tests, titles, strict=False):
+        panels.append(partial(_plot_test_over_time, fitted=test, title=title))
+        panels.append(partial(_plot_test_over_depth, fitted=test))
+        panels.append(partial(_plot_test_residual, fitted=test))
+    return panels
 
 
 def _plot_test_over_time(axes: Axes, fitted: FittedTest, title: str) -> None:

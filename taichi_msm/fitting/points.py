@@ -10,13 +10,15 @@ import math
 from abc import abstractmethod
 from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import Any, ClassVar, NamedTuple
+from functools import partial
+from typing import ClassVar, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from taichi_msm.fitting import observation, rejection
 from taichi_msm.fitting.observation import Array, ErrorCorrelation, Observation, ObservationModel
+from taichi_msm.fitting.panels import Panel, plot_match, plot_motion, plot_on_sheet
 from taichi_msm.model.surface import surface_weights
 from taichi_msm.render.camera import view_at
 from taichi_msm.runs.simulation import Simulation
@@ -151,13 +153,23 @@ class PointObservation(Observation):
         motion = self._motion(scene)
         return float(np.sqrt(np.nanmean(motion**2, axis=(1, 2)).max())) if len(motion) else math.inf
 
-    def fits_well(self, residuals: Array, deviation: float, signal: float) -> bool:
-        if self.sigma is None:
-            return deviation <= observation.MAX_RESIDUAL_SHARE * signal
-        return deviation <= observation.MAX_RESIDUAL_SIGMAS * self.sigma
+    def panels(self, scene: Scene, fitted: Array) -> list[Panel]:
+        panels: list[Panel] = []
+        # A single time shows no motion, a single point no map of residuals.
+        if np.sum(self.is_observed.any(axis=0)) > 1:
+            centre = np.nanmean(fitted, axis=1, keepdims=True)
+            x, y = ((values - centre)[self.known] for values in (fitted, self.values))
+            panels.append(partial(plot_motion, time=self.time, fitted=fitted, observed=self.values, unit=self.unit))
+            panels.append(partial(plot_match, fitted=x, observed=y, unit=self.unit, origin="the mean"))
+        if np.sum(self.is_observed.any(axis=1)) > 1:
+            residuals = np.sqrt(np.nanmean((fitted - self.values) ** 2, axis=(1, 2)))
+            on_sheet = partial(plot_on_sheet, coordinates=self.coordinates, size=scene.sheet.size)
+            panels.append(partial(on_sheet, residuals=residuals, unit=self.unit))
+        return panels
 
-    def summary(self, residuals: Array, sigma: float | Array) -> dict[str, Any]:
-        return {"residual": float(np.sqrt(np.mean(residuals**2))), "sigma": sigma, "unit": self.unit}
+    def format_residual(self, residual: float) -> str:
+        points, times = self.is_observed.shape
+        return f"{residual:.3g} {self.unit} of {points} points at {times} times"
 
     def faults(self, scene: Scene) -> Iterator[str]:
         """Yield a message about a sentinel value of lost points."""

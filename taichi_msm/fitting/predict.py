@@ -57,6 +57,11 @@ class FitProblem:
         low, high = np.array([parameter.limits for parameter in self.parameters]).T
         return low, high
 
+    @property
+    def difference_step(self) -> float:
+        """Step of finite differences, in units of x, large enough for all observations."""
+        return max(observed.difference_step(self.scene) for observed in self.observations)
+
     def build_model(self, threads: int | None) -> ForwardModel:
         """Build the forward model on a number of threads, by default on all cores."""
         return ForwardModel(self, threads)
@@ -104,7 +109,7 @@ class ForwardModel:
         frames = max(self._frames, plan.grid.frames + 1) if to_end else self._frames
         pairs = list(zip(models, self.record(models, simulation, frames, pause), strict=True))
         values = tuple(model.predict(recorded[: self._frames]) for model, recorded in pairs)
-        motion = np.max([model.motion(recorded) for model, recorded in pairs], axis=0)
+        motion = np.fmax.reduce([model.motion(recorded) for model, recorded in pairs])
         return Prediction(values, plan.grid.steps_per_frame, motion)
 
     def start(self, plan: Plan, steps: int | None, halvings: int) -> tuple[Simulation, Plan]:
@@ -117,7 +122,7 @@ class ForwardModel:
             if steps is None:
                 # Stable for finite differences around these parameters.
                 frame = 1 / plan.grid.frames_per_second
-                steps = math.ceil(2 * frame / plan.stable_step * (1 + difference_step(plan.scene)))
+                steps = math.ceil(2 * frame / plan.stable_step * (1 + self.problem.difference_step))
             plan = plan.with_grid(steps_per_frame=max(steps, plan.grid.steps_per_frame))
         if self._simulation is None:
             self._simulation = Simulation(plan, threads=self._threads)
@@ -166,14 +171,6 @@ class ForwardModel:
         """Release the simulation."""
         if self._simulation is not None:
             self._simulation.close()
-
-
-def difference_step(scene: Scene) -> float:
-    """Return the step of finite differences, in units of x.
-
-    Equilibria, solved to about 1e-6, and contacts, which change in jumps, need larger steps.
-    """
-    return 1e-2 if scene.time.at_rest or any(probe.moved for probe in scene.probes) else 1e-5
 
 
 # Forward model of the last fit in this process by token; at most one entry.

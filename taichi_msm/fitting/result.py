@@ -11,10 +11,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from taichi_msm.fitting.machine_fit import FittedTest
-from taichi_msm.fitting.observation import Array, Observation
+from taichi_msm.fitting.observation import Array, Observation, root_mean_square
 from taichi_msm.fitting.outliers import LeftOut
 from taichi_msm.fitting.parameters import rounded
-from taichi_msm.fitting.points import PointObservation
 from taichi_msm.fitting.profiles import ProfilePoint
 from taichi_msm.fitting.tikhonov import SmoothnessWeight
 from taichi_msm.fitting.uncertainty import UnidentifiedGroup
@@ -198,15 +197,17 @@ class FitResult:
             residual = (
                 f"{fitted.residual:.3g} N, {rounded(100 * fitted.residual / peak)} % of the peak, at {frames} frames"
             )
-            offset = f"offset {fitted.loading.offset:.3g} +- {rounded(fitted.offset_error)} N"
-            details = f"noise {fitted.loading.noise:.2g} N, {offset}, contact at {fitted.contact:.4g} m"
+            noise = f"noise of the first {fitted.loading.test.noise_rows} rows {fitted.loading.noise:.2g} N"
+            offset = f"offset {fitted.loading.offset:.3g} +- {rounded(fitted.offset_error)} N subtracted"
+            details = f"{noise}, {offset}, contact at {1000 * fitted.contact:.4g} mm"
             lines.append(f"{fitted.loading.test.name}: residual {residual}; {details}{chi_text}")
-        force_text = "" if self.residual_force is None else f", {self.residual_force:.3g} N"
-        for observed in self.observations:
-            if isinstance(observed, PointObservation):
-                points, times = observed.is_observed.shape
-                residual = f"residual {self.residual:.3g} {self.unit} of {points} points at {times} times"
-                lines.append(f"{residual}{force_text}{chi_text}")
+        if not self.tests:
+            pairs = zip(self.observations, self.fitted, strict=True)
+            residuals = [
+                observed.format_residual(root_mean_square((fitted - observed.values)[observed.known]))
+                for observed, fitted in pairs
+            ]
+            lines.append(f"residual {', '.join(residuals)}{chi_text}")
         lines += [str(item) for item in self.left_out]
         if self.mesh_error is not None:
             qualifier = "at most about " if any(probe.moved for probe in self.scene.probes) else ""

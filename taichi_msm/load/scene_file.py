@@ -282,7 +282,8 @@ class Draft:
             elif not isinstance(container, list):
                 return Problem(key, f"{format_value(container)} is not a section; set it as a whole")
             elif not (isinstance(part, int) and part < len(container)):
-                example = ".".join(map(str, (*key, 0, *path[n:][isinstance(part, int) :])))
+                is_number = str(part).isdecimal()  # in any script, or of any length
+                example = ".".join(map(str, (*key, 0, *path[n:][is_number:])))
                 message = f"no such item; the list has {len(container)}, counted from 0; an example is {example}"
                 if not container:
                     message = "no such item; the list is empty, so set it as a whole"

@@ -160,7 +160,7 @@ def build_loading(
     equidistant in depth. The default depth of contact [m of the table] is estimated from the forces, for a clamp it is
     the first depth.
     """
-    first = test.force[: _count_noise_rows(test)]
+    first = test.force[: test.noise_rows]
     offset = float(np.median(first))
     noise = max(NORMAL_FACTOR * float(np.median(np.abs(first - offset))), test.digit)
     test = replace(test, force=test.force - offset, time=test.time - test.time[0])
@@ -201,17 +201,12 @@ def require_plausible_travel(loading: Loading, scene: Scene) -> None:
         raise SceneError([f"{loading.test.name}: {fault}; {remedy}"])
 
 
-def _count_noise_rows(test: MachineTest) -> int:
-    """Return the number of first rows, which the noise is estimated from."""
-    return max(10, math.ceil(0.05 * len(test.force)))
-
-
 def _contact_row(test: MachineTest, noise: float, peak: int) -> int:
     """Return the last row without a significant force before the peak; the first row if there is none."""
     without_force = np.flatnonzero(test.force[: peak + 1] <= CONTACT_NOISES * noise)
     row = int(without_force[-1]) if len(without_force) else 0
     if row == peak:
-        fault = f"the force never exceeds 5 times its noise, {noise:.3g} N in the first {_count_noise_rows(test)} rows"
+        fault = f"the force never exceeds 5 times its noise, {noise:.3g} N in the first {test.noise_rows} rows"
         remedy = "give the depth by --contact if the tool touches from the start, or choose the force by --columns"
         raise SceneError([f"{test.name}: {fault}; {remedy}, or cut the table by --window"])
     return row
@@ -224,7 +219,7 @@ def late_contact_note(loading: Loading, key: str) -> str | None:
     """
     from scipy.stats import kendalltau
 
-    test, count = loading.test, _count_noise_rows(loading.test)
+    test, count = loading.test, loading.test.noise_rows
     significant = CONTACT_NOISES * loading.noise
     correlation = kendalltau(test.depth[:count], test.force[:count]).statistic
     # Ten independent rows have a rank correlation above 0.55 with a probability of 0.015.
@@ -232,7 +227,7 @@ def late_contact_note(loading: Loading, key: str) -> str | None:
         return None
     return (
         f"{test.name}: the force rises within the first {count} rows, so its noise, {loading.noise:.3g} N, is "
-        f"too large: the tool touches before {loading.contact:.4g} m, where the force is {significant:.3g} N; "
+        f"too large: the tool touches before {1000 * loading.contact:.4g} mm, where the force is {significant:.3g} N; "
         f"find the depth by --free {key}, or give it by --contact"
     )
 
@@ -261,7 +256,7 @@ def _sample_in_depth(test: MachineTest, noise: float, contact: float, *, finds_c
     half, order = 0.5 * (depth[1] - depth[0]), np.argsort(test.depth[:last], kind="stable")
     pressed = replace(test, time=test.time[order], depth=test.depth[order], force=test.force[order])
     frames = _means(pressed.depth, depth, half, pressed)
-    count = _count_noise_rows(test)
+    count = test.noise_rows
     if test.depth[:count].max() < depth[0] - 1.01 * half:
         # The first rows, with a median of 0, belong to the first frame. The variance of a median is pi / 2 times that
         # of a mean.

@@ -23,7 +23,7 @@ from taichi_msm.machines.workbook import read_workbook
 
 Array = NDArray[np.float64]
 
-# Smallest number of rows of a test, as the noise of the force is estimated from ten.
+# Smallest number of rows of a test, and of those that the noise of the force is estimated from.
 MIN_ROWS = 10
 
 # Clause of the note about torn tissue.
@@ -77,6 +77,11 @@ class MachineTest:
     force: Array  # forces [N], shape (n,), signed likewise
     digit: float  # resolution of the forces: their last digit in the file [N]
     notes: tuple[str, ...] = ()  # warnings about choices of the reader, and about the test
+
+    @property
+    def noise_rows(self) -> int:
+        """Number of first rows, which the noise of the force is estimated from."""
+        return max(MIN_ROWS, math.ceil(0.05 * len(self.force)))
 
 
 @dataclass(frozen=True)

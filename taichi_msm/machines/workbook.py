@@ -17,7 +17,7 @@ from functools import lru_cache
 from xml.parsers import expat
 
 from taichi_msm.errors import SceneError
-from taichi_msm.machines.cells import MAX_BYTES, Grid, Row, read_bytes
+from taichi_msm.machines.cells import MAX_BYTES, NUMBER_PATTERN, Grid, Row, read_bytes
 
 # Limits of all sheets: bytes of XML, its characters < and =, which begin tags and values of attributes; rows and cells,
 # including empty ones before others; characters of cells.
@@ -37,8 +37,8 @@ DATE_FORMATS = {*range(14, 23), *range(27, 37), *range(45, 48), *range(50, 59)}
 LITERAL = re.compile(r'"[^"]*"|\[(?![hms]+\])[^\]]*\]|[\\_*].', re.IGNORECASE)
 DAY_0 = datetime.datetime(1899, 12, 30)
 
-# Letters of a column, and a range of merged cells.
-LETTERS = re.compile("[A-Z]{1,3}")
+# Letters of a column, number of a row or a text, and a range of merged cells.
+LETTERS, INDEX = re.compile("[A-Z]{1,3}"), re.compile("[0-9]{1,9}")
 RANGE = re.compile(r"([A-Z]{1,3})([0-9]{1,7}):([A-Z]{1,3})([0-9]{1,7})")
 
 Attributes = dict[str, str]
@@ -146,7 +146,7 @@ class _Workbook:
                 cell, value, formula = attributes, "", ""
                 column = _column_index(cell["r"].rstrip("0123456789")) if "r" in cell else column + 1
             elif tag == "row":
-                row, column = int(attributes.get("r", row + 2)) - 1, -1
+                row, column = _index(attributes["r"]) - 1 if "r" in attributes else row + 1, -1
             elif tag == "mergeCell" and (corners := RANGE.fullmatch(attributes["ref"])):
                 first, last = _column_index(corners[1]), _column_index(corners[3])
                 if first < last:
@@ -163,7 +163,7 @@ class _Workbook:
             elif tag == "c" and (value or formula):
                 kind = cell.get("t", "n")
                 if value:
-                    value = texts[int(value)] if kind == "s" else _format(value, kind, cell.get("s") in dates)
+                    value = texts[_index(value)] if kind == "s" else _format(value, kind, cell.get("s") in dates)
                 if shown := " ".join((value or formula).split()):
                     self._put(grid.rows, row, column, shown)
 
@@ -262,6 +262,13 @@ def _require(what: str, amount: int, limit: int) -> None:
         raise LimitError(f"more than {limit:,} {what}")
 
 
+def _index(digits: str) -> int:
+    """Convert decimal digits to a number; unlike `int`, refuse signs, underscores and other digits."""
+    if not INDEX.fullmatch(digits):
+        raise ValueError
+    return int(digits)
+
+
 @lru_cache(MAX_COLUMNS)
 def _column_index(letters: str) -> int:
     """Return the index of the column of given letters, from 0."""
@@ -276,8 +283,10 @@ def _column_index(letters: str) -> int:
 def _format(value: str, kind: str, is_date: bool) -> str:
     """Format the value of a cell of a kind, numbers with the 15 digits of Excel."""
     if kind == "b":
-        return str(bool(int(value)))
+        return str(bool(_index(value)))
     if kind == "n":
+        if not NUMBER_PATTERN.fullmatch(value):
+            raise ValueError
         if not is_date:
             return format(float(value), ".15g") if {*value} & {*".eE"} else str(int(value))
         with suppress(OverflowError):

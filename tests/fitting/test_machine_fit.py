@@ -271,7 +271,8 @@ def test_rejection_of_a_contact_found_in_a_slack(device: Device, tmp_path: Path,
     assert result.tests[0].contact < 0.61e-3
     (note,) = (note for note in result.notes if "slack.csv" in note)
     message(result.summary(), "--contact", hide=r"-?\d[\d.e+-]*")
-    contact = float(note.partition("a contact at ")[2].split()[0])
+    contact = float(note.partition("give --contact ")[2].partition(",")[0])
+    assert f"a contact at {1000 * contact:g} mm of the table" in note
     assert contact == pytest.approx(1.6e-3, abs=0.1e-3)
     young = estimate(scene(), table, [YOUNG], contact=[contact]).parameters[YOUNG].value
     assert young == pytest.approx(FOUNDATION["young"], rel=0.1)

@@ -321,6 +321,7 @@ def test_long_overrides(overrides: list[str], image: str | None, load: Load, mes
         (["springs.shaer=3"], "springs.shaer"),
         (["probes.0.load.1=[-1, 0]"], "probes.0.load.1"),
         (["probes.1.offset=1"], "probes.1"),
+        (["probes.\u0661.offset=1"], "probes.\u0661"),
         (["probes=[]", "probes.0.load=[[0, 1]]"], "probes.0"),
         (["damping.x=1"], "damping"),
         (["damping"], ""),

@@ -144,6 +144,14 @@ def test_workbook_without_hostile_parts_is_read(tmp_path: Path) -> None:
     assert len(read_machine_test(tmp_path / "table.xlsx").time) == 12
 
 
+def test_only_numbers_of_workbooks_are_read(tmp_path: Path) -> None:
+    """Neither underscores, which Python accepts, nor digits of other scripts, nor indices from the end."""
+    for text, kind in (("1_000", "n"), ("1_0.5", "n"), ("\u0661", "n"), ("-1", "s"), ("1_0", "b")):
+        (tmp_path / "table.xlsx").write_bytes(workbook(row(cell(text, kind)), texts="<si><t>a</t></si>" * 20))
+        with pytest.raises(SceneError, match="damaged"):
+            read_machine_test(tmp_path / "table.xlsx")
+
+
 def answer(connection: Connection, forces: bool) -> None:
     """Read the tables of a connection; answer with an empty text, or with an error other than a SceneError."""
     while request := connection.recv():
