@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -18,15 +19,8 @@ if TYPE_CHECKING:
 
 @options.program.command()
 @click.argument("scene", metavar="SCENE", required=False)
-@click.option(
-    "--out",
-    metavar="DIR",
-    help="Directory for the results.  [default: output/<name of the scene file>; with --again, its DIR]",
-)
-@options.image_option
-@options.set_option
-@options.arch_option
-@options.threads_option
+@options.out_option("Directory for the results.", "output/<name of the scene file>; with --again, its DIR")
+@options.device_options
 @click.option(
     "--estimate-error/--no-estimate",
     default=None,
@@ -35,7 +29,7 @@ if TYPE_CHECKING:
 @options.quality_option
 @click.option("--resume", metavar="DIR", help="Continue the unfinished run in DIR instead of running SCENE.")
 @click.option("--again", metavar="DIR", help="Repeat the run of DIR/run.json instead of running SCENE.")
-@click.option("--quiet", is_flag=True, help="Print no progress and no summary.")
+@options.quiet_option
 @options.json_option
 @click.pass_context
 def run(
@@ -44,14 +38,13 @@ def run(
     out: str | None,
     image: str | None,
     overrides: tuple[str, ...],
-    arch: str,
     threads: int | None,
-    estimate_error: bool | None,
     quality: int | None,
     resume: str | None,
     again: str | None,
     quiet: bool,
     as_json: bool,
+    **settings: Any,
 ) -> int:
     """Simulate SCENE, draw its frames and write them."""
     overrides += () if quality is None else (f"render.quality={quality}",)
@@ -94,16 +87,8 @@ def run(
         if resume is not None:
             record = run_module.resume(directory, threads=threads, started=START_TIME, progress=progress)
         else:
-            record = run_module.run(
-                plan,
-                directory,
-                arch=arch,
-                threads=threads,
-                overrides=recorded,
-                estimate_error=estimate_error,
-                started=START_TIME,
-                progress=progress,
-            )
+            settings |= {"threads": threads, "overrides": recorded, "started": START_TIME, "progress": progress}
+            record = run_module.run(plan, directory, **settings)
     if as_json:
         common.print_json({"directory": str(directory), **record})
     if record["status"] != "complete":
@@ -143,20 +128,11 @@ def check(scene: str, image: str | None, overrides: tuple[str, ...], as_json: bo
         cost.require_disk(plan, Path("output"))
         if plan.scene.draws:
             load_texture(plan.scene)
-    loaded, grid, stable_step = plan.scene, plan.grid, plan.stable_step
-    steps = {
-        "step": grid.step,
-        "stable_step": stable_step if stable_step < float("inf") else None,
-        "steps_per_frame": grid.steps_per_frame,
-        "precision": grid.precision,
-        "steps": grid.steps,
-    }
-    if loaded.time.at_rest:
-        steps |= dict.fromkeys(("step", "stable_step", "steps_per_frame", "steps"))
+    loaded, grid = plan.scene, plan.grid
     budget, duration = cost.estimate_budget(plan), cost.estimate_duration(plan)
     report: dict[str, Any] = {
         "scene": loaded.model_dump(mode="json"),
-        **steps,
+        **cost.step_entries(plan, grid.frames),
         "frames": budget.frames,
         "estimated_seconds": duration.seconds,
         "memory": budget.memory_bytes,
@@ -178,11 +154,11 @@ def check(scene: str, image: str | None, overrides: tuple[str, ...], as_json: bo
     stepping = (
         f"each at rest{more}, in {grid.precision}"
         if loaded.time.at_rest
-        else f"{budget.steps} steps of {grid.step:.6g} s (limit {stable_step:.6g} s{_lock_cost(plan)}), "
+        else f"{grid.steps} steps of {grid.step:.6g} s (limit {plan.stable_step:.6g} s{_lock_cost(plan)}), "
         f"{grid.steps_per_frame} a frame{more}, in {grid.precision}"
     )
     click.echo(
-        f"\n{budget.points} points, {budget.frames} frames, {stepping}\n"
+        f"\n{math.prod(loaded.sheet.points)} points, {budget.frames} frames, {stepping}\n"
         f"about {cost.format_rough_time(duration.seconds)} to run{longer} (estimated from its work)\n"
         f"about {budget.memory_bytes / 2**20:.0f} MiB of memory, at most {budget.disk_bytes / 2**20:.1f} MiB on disk, "
         f"{budget.working_bytes / 2**20:.1f} MiB more while it runs"

@@ -46,7 +46,6 @@ from taichi_msm.runs.simulation import Simulation
 from taichi_msm.runs.writer import ResultWriter, RunRecord
 from taichi_msm.scene.scene import Scene
 from taichi_msm.solver.planning import ENCODING_WORK
-from taichi_msm.solver.state import RunProgress
 from taichi_msm.system import process, runtime
 from taichi_msm.system.compiler import versions
 from taichi_msm.system.runtime import Device
@@ -153,13 +152,11 @@ def run(
     manifest = Manifest(
         given, plan.scene, tuple(overrides), estimate, mesh, estimate_error, current_folder, arch, sha256, versions()
     )
-    context = _RunContext(manifest, plan, texture, device, folder)
+    context = _RunContext(manifest, plan, texture, device, folder, stopwatch, progress)
     if unfinished := _find_unfinished(context):
         with suppress(DamagedError):  # a damaged run starts again
-            return _execute(
-                context._replace(manifest=_add_current_versions(unfinished)), stopwatch, progress, resumes=True
-            )
-    return _execute(context, stopwatch, progress, resumes=False)
+            return _execute(context._replace(manifest=_add_current_versions(unfinished)), resumes=True)
+    return _execute(context, resumes=False)
 
 
 def resume(
@@ -197,8 +194,8 @@ def resume(
     manifest.require_same_inputs(input_digests(plan), versions())
     texture = load_texture(plan.scene, manifest.sha256.get("image")) if plan.scene.draws else None
     device = runtime.start(manifest.arch, threads)
-    context = _RunContext(_add_current_versions(manifest), plan, texture, device, Path(directory))
-    return _execute(context, stopwatch, progress, resumes=True)
+    manifest = _add_current_versions(manifest)
+    return _execute(_RunContext(manifest, plan, texture, device, Path(directory), stopwatch, progress), resumes=True)
 
 
 def _require_callbacks(started: float | None, progress: StageProgressCallback) -> None:
@@ -224,23 +221,23 @@ def _add_current_versions(manifest: Manifest) -> Manifest:
 
 
 class _RunContext(NamedTuple):
-    """Inputs, device and destination of a run."""
+    """Inputs, device and destination of a run, and the observers of its stages."""
 
     manifest: Manifest  # inputs on which the results depend
     plan: Plan  # of the manifest's resolved scene
     texture: NDArray[np.uint8] | None  # the picture on the sheet, if the scene is drawn
     device: Device
     directory: Path  # destination of the results
+    stopwatch: Stopwatch
+    progress: StageProgressCallback
 
 
-def _execute(
-    context: _RunContext, stopwatch: Stopwatch, progress: StageProgressCallback, *, resumes: bool
-) -> RunRecord:
+def _execute(context: _RunContext, *, resumes: bool) -> RunRecord:
     """Simulate, draw and publish all frames; with `resumes`, only those missing in the directory."""
     with ExitStack() as opened:
-        run = _Run(context, stopwatch, progress, opened, resumes=resumes)
+        run = _Run(context, opened, resumes=resumes)
         run.verify_stored_frames()
-        with stopwatch.stage("write"):
+        with context.stopwatch.stage("write"):
             try:
                 run.prepare()
                 run.simulate_frames()
@@ -255,30 +252,17 @@ def _execute(
 class _Run:
     """Run in progress: the simulation, its companion runs and the writer of the results."""
 
-    def __init__(
-        self,
-        context: _RunContext,
-        stopwatch: Stopwatch,
-        progress: StageProgressCallback,
-        opened: ExitStack,
-        *,
-        resumes: bool,
-    ) -> None:
-        self._context, self._stopwatch, self._progress = context, stopwatch, progress
+    def __init__(self, context: _RunContext, opened: ExitStack, *, resumes: bool) -> None:
+        self._context, self._stopwatch, self._progress = context, context.stopwatch, context.progress
         plan, device, manifest = context.plan, context.device, context.manifest
         self._frames = plan.grid.frames + 1
-        progress("compile", 0, self._frames)
+        self._progress("compile", 0, self._frames)
         self._cores = cores = free_cores(plan)
-        # The writer is created first, so that its encoder starts while kernels are compiled. With one thread, no core
-        # is free for the encoder.
-        in_subprocess = device.threads > 1
-        self._writer = opened.enter_context(
-            ResultWriter(
-                context.directory, plan, manifest.as_json(), resumes=resumes, encode_in_subprocess=in_subprocess
-            )
-        )
+        # The writer is created first, so that its encoder starts while kernels are compiled.
+        writer = ResultWriter(context.directory, plan, manifest.as_json(), resumes=resumes, threads=device.threads)
+        self._writer = opened.enter_context(writer)
         self._simulation = opened.enter_context(Simulation(plan, device.arch, device.threads, context.texture, cores))
-        self._resumed_frames = self._writer.stored_frames
+        self._resumed_frames = self._writer.checkpoint.frames
         companions = _choose_companions(context, resumed=self._resumed_frames > 0)
         self._error_estimator: RunErrorEstimator | None = None
         self._path_dependence = PathDependence(plan) if plan.scene.time.at_rest else None
@@ -298,7 +282,7 @@ class _Run:
         """Verify the checksums of stored positions before they are used."""
         for frame in range(self._resumed_frames if self._context.plan.scene.output else 0):
             self._progress("check", frame, self._resumed_frames)
-            self._writer.read_positions(frame)
+            self._writer.checkpoint.read_positions(frame)
 
     def prepare(self) -> None:
         """Compile, and restore the simulation to the state of the unfinished run."""
@@ -324,7 +308,8 @@ class _Run:
             report()
             with stage("simulate"):
                 simulation.advance(max(0, frame - simulation.frame), self._pause)
-            position = writer.read_positions(frame) if frame < self._resumed_frames else simulation.positions()
+            is_stored = frame < self._resumed_frames
+            position = writer.checkpoint.read_positions(frame) if is_stored else simulation.positions()
             if frame == writer.frames:  # otherwise it is stored, and has no pictures or labels
                 with stage("render"):
                     time = frame / scene.time.frames_per_second
@@ -343,7 +328,7 @@ class _Run:
         if self._error_estimator and frame > 0:
             with self._stopwatch.stage("pilot"):
                 is_stored = frame < self._resumed_frames
-                by_probe = self._writer.read_forces(frame) if is_stored else self._simulation.forces()
+                by_probe = self._writer.checkpoint.read_forces(frame) if is_stored else self._simulation.forces()
                 forces = np.array([by_probe[tool.probe].force for tool in self._context.plan.tools]).reshape(-1, 3)
                 self._error_estimator.compare_frame(displacement, pause, forces)
 
@@ -352,7 +337,7 @@ class _Run:
         scene, stage = self._context.plan.scene, self._stopwatch.stage
         if self._error_estimator:
             rest = rest_positions(scene.sheet)
-            displacements = (self._writer.read_positions(frame) - rest for frame in range(1, self._frames))
+            displacements = (self._writer.checkpoint.read_positions(frame) - rest for frame in range(1, self._frames))
             with stage("pilot"):
                 self._error_estimator.finish(displacements if scene.output else None, partial(self._progress, "pilot"))
         if self._path_dependence and self._seeks_second_solutions:
@@ -364,10 +349,10 @@ class _Run:
         """Save the state and the finished frames of an interrupted run; reraise if there is no new frame."""
         writer, simulation = self._writer, self._simulation
         # A saved state needs all of its frames, and the last simulated frame may not be stored yet.
-        if simulation.steps > 0 and simulation.frame < writer.stored_frames and not simulation.inconsistent:
+        if simulation.steps > 0 and simulation.frame < writer.checkpoint.frames and not simulation.inconsistent:
             # A divergence within this frame will recur in the resumed run.
             with suppress(DivergedError):
-                writer.save(simulation.save())
+                writer.checkpoint.save(simulation.save())
         if writer.frames > self._resumed_frames:
             writer.finish()
         if writer.frames <= self._resumed_frames:  # `finish` drops an incomplete last frame
@@ -381,10 +366,10 @@ class _Run:
         ending: dict[str, Any] = {"status": "diverged", "error": str(error), "dump": None}
         with suppress(KeyboardInterrupt):
             report = partial(self._progress, "diagnosis", writer.frames, self._frames)
-            diagnosis = self._simulation.diagnose(writer.load(), report)
+            diagnosis = self._simulation.diagnose(writer.checkpoint.load(), report)
             ending["error"] = diagnosis.message
             if diagnosis.last_sound_state:
-                ending["dump"] = writer.save(diagnosis.last_sound_state)
+                ending["dump"] = writer.checkpoint.save(diagnosis.last_sound_state)
         return ending
 
     def publish_results(self, ending: dict[str, Any]) -> RunRecord:
@@ -438,7 +423,8 @@ class _Run:
             "sha256": dict(manifest.sha256),
             "overrides": list(manifest.overrides),
             "points": list(scene.sheet.points),
-            **_step_entries(plan, progress),
+            **cost.step_entries(plan, progress.frame),
+            **({"residual": progress.residual, "evaluations": progress.evaluations} if scene.time.at_rest else {}),
             "max_displacement": progress.max_displacement,
             "max_displacement_frame": progress.max_displacement_frame,
             "shortest_spring": progress.shortest_spring,
@@ -453,8 +439,8 @@ class _Run:
         """Report the progress within a frame, and save the state when due."""
         with self._stopwatch.stage("write"):
             self._progress("frames", self._writer.frames, self._frames)
-            if self._writer.is_save_due:
-                self._writer.save(self._simulation.save())
+            if self._writer.checkpoint.is_save_due:
+                self._writer.checkpoint.save(self._simulation.save())
 
 
 def _choose_companions(context: _RunContext, *, resumed: bool) -> CompanionRuns:
@@ -474,22 +460,6 @@ def _runs_within_an_hour(plan: Plan) -> bool:
     return cost.estimate_duration(plan).seconds <= 3600
 
 
-def _step_entries(plan: Plan, progress: RunProgress) -> dict[str, Any]:
-    """Build the entries about the time steps, or for a quasi-static scene about the residual."""
-    grid, limit = plan.grid, plan.stable_step
-    if plan.scene.time.at_rest:
-        steps = dict.fromkeys(("step", "stable_step", "steps_per_frame", "steps"))
-        residual = {"residual": progress.residual, "evaluations": progress.evaluations}
-        return {**steps, "precision": grid.precision, **residual}
-    return {
-        "step": grid.step,
-        "stable_step": limit if limit < math.inf else None,
-        "steps_per_frame": grid.steps_per_frame,
-        "precision": grid.precision,
-        "steps": progress.frame * grid.steps_per_frame,
-    }
-
-
 def free_cores(plan: Plan) -> int:
     """Return the number of cores for stepping: all, or one less if encoding takes longer than stepping."""
     width, height = plan.scene.render.size
@@ -502,8 +472,8 @@ def free_cores(plan: Plan) -> int:
 def _requested_values(given: Scene, scene: Scene) -> dict[str, Any]:
     """Return the requested values that differ from the resolved ones, by dotted key."""
     keys = ("sheet.points", "sheet.tolerance", "time.step", "time.precision", "time.tolerance")
-    pairs = [(key, attrgetter(key)(given), attrgetter(key)(scene)) for key in keys]
-    return {key: requested for key, requested, resolved in pairs if requested != resolved}
+    values = zip(keys, attrgetter(*keys)(given), attrgetter(*keys)(scene), strict=True)
+    return {key: requested for key, requested, resolved in values if requested != resolved}
 
 
 def _pixels_per_metre(scene: Scene) -> float | None:
