@@ -13,7 +13,7 @@ from benchmarks.process import call
 from benchmarks.race import Progress
 from benchmarks.whole_run import SCENE, command
 from taichi_msm.model.surface import place_instruments
-from taichi_msm.render.camera import view
+from taichi_msm.render.camera import Shot, view
 from taichi_msm.render.labels import requested_labels
 from taichi_msm.render.rasterizer import Rasterizer, drawing_config
 from taichi_msm.render.tracking import compute_flow
@@ -86,7 +86,7 @@ def variants(problem: Problem) -> dict[str, Callable[[], Any]]:
         "tissue, instrument": picture(with_instrument(tissue)),
         "headlight and labels": picture(plain, labels=True),
         LABELS: picture(plain, picture=False, labels=True),
-        "flow and occlusion": lambda: compute_flow(plain, coordinates, problem.rest, camera),
+        "flow and occlusion": lambda: compute_flow(plain, coordinates, Shot(problem.rest, camera)),
         **{f"tissue, instrument, {name}": picture(made) for name, made in pinholes.items()},
         **{f"{LABELS}, {name}": picture(made, picture=False, labels=True) for name, made in pinholes.items()},
     }

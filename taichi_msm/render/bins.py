@@ -55,7 +55,8 @@ def build_bins(launches: Launches, bounds: Any, cells: int, extent: tuple[int, i
     if not launches.bounded:
         lengths, entries = np.zeros(columns * rows, np.int32), np.empty(max(1, total), np.int32)
         with compilation_options(optimised=False):
-            _count_cells(cells, size, columns, bounds, lengths)
+            # The first call only counts: its lists all start at 0.
+            _list_cells(cells, size, columns, bounds, lengths, entries)
             starts = np.concatenate([[0], np.cumsum(lengths)]).astype(np.int32)
             _list_cells(cells, size, columns, bounds, starts[:-1].copy(), entries)
         return Bins(size, columns, lengths.reshape(rows, columns), starts, entries)
@@ -102,16 +103,6 @@ def _bin_range(cell, size, bounds: ti.template()):
         bounds[entry + FIRST_Y] // size,
         bounds[entry + LAST_Y] // size + 1,
     )
-
-
-@ti.kernel
-def _count_cells(cells: ti.i32, size: ti.i32, columns: ti.i32, bounds: Integers, counts: Integers):
-    ti.loop_config(serialize=True)
-    for cell in range(cells):
-        left, right, top, bottom = _bin_range(cell, size, bounds)
-        for row in range(top, bottom):
-            for column in range(left, right):
-                counts[row * columns + column] += 1
 
 
 @ti.kernel

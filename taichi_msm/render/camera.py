@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from taichi_msm.errors import Key, Problem, SceneError
 from taichi_msm.lenses.model import MAX_RADIUS
+from taichi_msm.model.surface import Solid
 from taichi_msm.render.lens import IDENTITY_LENS, Lens
 from taichi_msm.scene.camera import Camera
 from taichi_msm.scene.outputs import OUTPUTS
@@ -114,6 +115,14 @@ class View(NamedTuple):
         return self._replace(matrix=matrix)
 
 
+class Shot(NamedTuple):
+    """Sheet, camera and instruments at a time."""
+
+    positions: NDArray[Any]  # of the mass points [m], shape (rows, cols, 3)
+    view: View
+    instruments: Sequence[Solid] = ()  # bodies of the tools
+
+
 def calibration(camera: View) -> dict[str, Any]:
     """Return the matrices of a camera in the conventions of other programs.
 
@@ -169,7 +178,7 @@ def _view_of(scene: Scene, time: float, name: str) -> View:
     elif isinstance(camera, Camera) and camera.beside is not None:
         result = _companion(camera, scene, _view_of(scene, time, camera.beside))
     else:
-        result = _pinhole(camera if isinstance(camera, Camera) else _preset(camera, scene), scene, time)
+        result = _pinhole(camera if isinstance(camera, Camera) else PRESET_CAMERAS[camera](scene), scene, time)
     if baseline:
         shift, matrix = baseline * result.axes[0], result.matrix.copy()
         matrix[:, 3] -= matrix[:, :3] @ shift
@@ -208,9 +217,9 @@ def pair_transform(camera: AnyCamera) -> dict[str, Any]:
 def is_moving(scene: Scene, name: str = "") -> bool:
     """Return whether a camera moves; by default the main camera."""
     camera, _ = scene.render.origin(name or scene.render.main)
-    if isinstance(camera, Camera) and camera.beside is not None:
-        return is_moving(scene, camera.beside)
-    return isinstance(camera, Camera) and camera.moves
+    if not isinstance(camera, Camera):
+        return False
+    return camera.moves if camera.beside is None else is_moving(scene, camera.beside)
 
 
 def camera_problems(scene: Scene) -> Iterator[Problem]:
@@ -244,11 +253,8 @@ def _placement_problems(camera: Camera, scene: Scene, name: str) -> Iterator[Pro
             yield Problem(("rotation",), fault)
         key, distance = "translation", math.hypot(*camera.translation)
     if distance > MAX_BASELINE_RATIO * max(scene.sheet.size):
-        message = (
-            f"moves the camera by more than {MAX_BASELINE_RATIO:g} times the size of the sheet; take a smaller number, "
-            "in metres"
-        )
-        yield Problem((key,), message)
+        message = f"moves the camera by more than {MAX_BASELINE_RATIO:g} times the size of the sheet"
+        yield Problem((key,), f"{message}; take a smaller number, in metres")
 
 
 def _rotation_fault(rotation: Array) -> str:
@@ -271,14 +277,14 @@ def _pair_problems(scene: Scene) -> Iterator[Problem]:
         message = f"{output_name} needs a stereo pair; take render.cameras with {{beside: NAME, baseline: metres}}"
         yield Problem(("output",), f"{message}, or leave it out")
     for name, companion in pairs.items() if "disparity" in scene.output else ():
-        message = ""
         if view_at(scene, 0.0, name).lens is not None:
             message = f"disparity requires cameras without distortion, and {name} has one; leave out one of them"
         elif cameras[companion].baseline is None:  # type: ignore[union-attr]
             message = f"disparity requires a baseline, and {companion} has a rotation; take stereo instead"
-        if message:
-            yield Problem(("output",), message)
-            return
+        else:
+            continue
+        yield Problem(("output",), message)
+        return
 
 
 def _extrinsics_problems(camera: Camera, scene: Scene) -> Iterator[Problem]:
@@ -337,10 +343,9 @@ def _lens_problems(camera: View) -> Iterator[Problem]:
         return bool(np.isnan(camera.undistort(camera.centre + radius * circle)).any())
 
     valid_px = max(0, bisect_left(range(corner_px), True, key=is_invalid) - 1)
-    message = (
-        f"{fault} at {valid_px} px from the principal point, and the picture reaches {corner_px} px; take coefficients"
-    )
-    yield Problem(("distortion",), f"{message} that are valid in the whole picture, or set outside: background")
+    message = f"{fault} at {valid_px} px from the principal point, and the picture reaches {corner_px} px"
+    remedy = "take coefficients that are valid in the whole picture, or set outside: background"
+    yield Problem(("distortion",), f"{message}; {remedy}")
 
 
 def border_points(size: Array) -> Array:
@@ -360,7 +365,7 @@ def pinhole(scene: Scene, time: float = 0.0) -> Camera:
     if isinstance(camera, Camera):
         return frozen_camera(camera, time)
     if camera != "top":
-        return _preset(camera, scene)
+        return PRESET_CAMERAS[camera](scene)
     half_height = scene.render.size[1] / 2 / _top_scale(scene)
     return Camera(eye=(0.0, 0.0, half_height / math.tan(math.radians(OBLIQUE_FOV) / 2)), fov=OBLIQUE_FOV)
 
@@ -432,13 +437,9 @@ def _pinhole_at(camera: Camera, scene: Scene, placement: Extrinsics) -> View:
     matrix = np.array([[*row, -row @ eye] for row in rows])
     near, size = 1e-6 * math.hypot(*scene.sheet.size), np.array([width_px, height_px], float)
     scale, centre = np.array([focal_x, focal_y]), np.array([x, y])
-    lens = Lens(camera.distortion.model, camera.distortion.coefficients) if camera.distortion else IDENTITY_LENS
-    lens_or_none = None if lens == IDENTITY_LENS else lens
-    return View(matrix, near, axes, eye, scale, centre, size, distance, pinhole=True, lens=lens_or_none)
-
-
-def _preset(name: str, scene: Scene) -> Camera:
-    return _oblique(scene) if name == "oblique" else _fit(scene)
+    lens = Lens(camera.distortion.model, camera.distortion.coefficients) if camera.distortion else None
+    lens = None if lens == IDENTITY_LENS else lens
+    return View(matrix, near, axes, eye, scale, centre, size, distance, pinhole=True, lens=lens)
 
 
 def _fit(scene: Scene) -> Camera:
@@ -468,6 +469,9 @@ def _oblique(scene: Scene) -> Camera:
     half = np.array([half_height * width_px / height_px, half_height])
     distance = float((corners[:, 2:] + np.abs(corners[:, :2]) / half).max()) * 1.04
     return Camera(eye=tuple(distance * toward), fov=OBLIQUE_FOV)
+
+
+PRESET_CAMERAS = {"oblique": _oblique, "fit": _fit}
 
 
 class Extrinsics(NamedTuple):

@@ -419,9 +419,8 @@ def _store_surface(
         )
         # At a fold the interpolated normal may point away from the camera; `side` flips it.
         normal = _normal_at(across, along, cell, band)
-        store_visible(entry + plane.normal_x, visible, normal[0] * side, samples)
-        store_visible(entry + plane.normal_y, visible, normal[1] * side, samples)
-        store_visible(entry + plane.normal_z, visible, normal[2] * side, samples)
+        for n in ti.static(range(3)):
+            store_visible(entry + (plane.normal_x + n), visible, normal[n] * side, samples)
         store_visible(entry + plane.footprint, visible, size, samples)
     if ti.static(config.wireframe):
         right_x, right_y, below_x, below_y = x + 1.0, y, x, y + 1.0

@@ -2,16 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Mapping
 from functools import partial
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from taichi_msm.errors import ArgumentError, as_array, did_you_mean, is_real_array
-from taichi_msm.model.surface import Solid
-from taichi_msm.render.camera import View, is_moving, view, view_at
+from taichi_msm.render.camera import Shot, View, is_moving, view, view_at
 from taichi_msm.render.labels import LABELS, Flow, FrameOutputs, Labels, Sight, Stereo, requested_labels, track_grid
 from taichi_msm.render.texture import load_texture
 from taichi_msm.scene.camera import Camera
@@ -26,14 +25,6 @@ if TYPE_CHECKING:
 CameraLike = str | Mapping[str, Any] | Camera | View | None
 
 Array = NDArray[Any]
-
-
-class Shot(NamedTuple):
-    """Sheet, camera and instruments at a time."""
-
-    positions: Array  # of the mass points [m], shape (rows, cols, 3)
-    view: View
-    instruments: Sequence[Solid] = ()  # bodies of the tools
 
 
 class Renderer:
@@ -110,7 +101,7 @@ class Renderer:
             raise ArgumentError(f"before: take the result of `labels` for a picture of {width} x {height} pixels")
         from taichi_msm.render.tracking import compute_flow
 
-        return compute_flow(self.scene, points, *shot)
+        return compute_flow(self.scene, points, shot)
 
     def locate(self, coordinates: Array, shot: Shot) -> Sight:
         """Project material points, with coordinates on the sheet, shape (n, 2), and determine their occlusion.
@@ -124,7 +115,7 @@ class Renderer:
             )
         from taichi_msm.render.tracking import locate_points
 
-        return locate_points(self.scene, points, *shot)
+        return locate_points(self.scene, points, shot)
 
     def observe(self, before: Labels | None, shot: Shot) -> FrameOutputs:
         """Render all outputs that the scene requests; `before` are the labels of the previous frame, if any."""
@@ -157,7 +148,7 @@ class Renderer:
             return Stereo(disparity)
         from taichi_msm.render.tracking import compute_stereo
 
-        return Stereo(disparity, *compute_stereo(self.scene, labels, *shot))
+        return Stereo(disparity, *compute_stereo(self.scene, labels, shot))
 
     def _labels(self, shot: Shot, names: Collection[str]) -> Labels:
         labels = self._rasterizer(picture=False, labels=names, view=shot.view).render(*shot).labels

@@ -341,12 +341,9 @@ def _filter_texture(entry, is_covered, texels: ti.template(), band: ti.template(
     float_vector, integer_vector, plane = ti.static((config.float_vector, config.integer_vector, config.plane))
     x = ti.select(is_covered, samples[entry + plane.texel_x], 0.0)
     y = ti.select(is_covered, samples[entry + plane.texel_y], 0.0)
-    first, width, height = (
-        integer_vector(0),
-        integer_vector(sizes[uni.LEVELS + 1]),
-        integer_vector(sizes[uni.LEVELS + 2]),
-    )
-    coarse_first, coarse_width, coarse_height = first, width, height
+    # First texel, width and height of the level of every sample, and of the next coarser level.
+    fine = [integer_vector(0), integer_vector(sizes[uni.LEVELS + 1]), integer_vector(sizes[uni.LEVELS + 2])]
+    coarse = [fine[n] for n in ti.static(range(3))]
     texel_size, footprint, max_footprint = float_vector(1), float_vector(0), 0.0
     if ti.static(config.tissue):
         footprint = ti.select(is_covered, samples[entry + plane.footprint], 0.0)
@@ -362,25 +359,21 @@ def _filter_texture(entry, is_covered, texels: ti.template(), band: ti.template(
                 coarse_entry = uni.LEVELS + uni.LEVEL_STRIDE * ti.min(level + 1, last_level)
                 if level > 0:
                     texel_size = ti.select(is_larger, texel_size * 2.0, texel_size)
-                    first = ti.select(is_larger, sizes[level_entry], first)
-                    width = ti.select(is_larger, sizes[level_entry + 1], width)
-                    height = ti.select(is_larger, sizes[level_entry + 2], height)
-                coarse_first = ti.select(is_larger, sizes[coarse_entry], coarse_first)
-                coarse_width = ti.select(is_larger, sizes[coarse_entry + 1], coarse_width)
-                coarse_height = ti.select(is_larger, sizes[coarse_entry + 2], coarse_height)
+                    for n in ti.static(range(3)):
+                        fine[n] = ti.select(is_larger, sizes[level_entry + n], fine[n])
+                for n in ti.static(range(3)):
+                    coarse[n] = ti.select(is_larger, sizes[coarse_entry + n], coarse[n])
                 bound = bound * 4.0
                 level += 1
             x = (x + 0.5) / texel_size - 0.5
             y = (y + 0.5) / texel_size - 0.5
-    colour, slope_x, slope_y = _fetch(first, width, height, x, y, texels, config)
+    colour, slope_x, slope_y = _fetch(*fine, x, y, texels, config)
     if ti.static(config.tissue):  # noqa: SIM102  (evaluated at compile time)
         if max_footprint > 1.0:
             # The same position in the next coarser level.
             x = x * 0.5 - 0.25
             y = y * 0.5 - 0.25
-            coarse_colour, coarse_slope_x, coarse_slope_y = _fetch(
-                coarse_first, coarse_width, coarse_height, x, y, texels, config
-            )
+            coarse_colour, coarse_slope_x, coarse_slope_y = _fetch(*coarse, x, y, texels, config)
             coarse_weight = ti.max(ti.min(ti.sqrt(footprint) / texel_size - 1.0, 1.0), 0.0)
             for n in ti.static(range(3)):
                 colour[n] += (coarse_colour[n] - colour[n]) * coarse_weight

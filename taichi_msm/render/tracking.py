@@ -5,18 +5,17 @@ instrument is nearer on its line of sight. Bins list the cells on which that par
 """
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from functools import cache
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from taichi_msm.model.surface import Solid
 from taichi_msm.render import geometry, lens_kernels
 from taichi_msm.render import uniforms as uni
 from taichi_msm.render.bins import BOUNDS_STRIDE, build_bins, store_bounds
-from taichi_msm.render.camera import View
+from taichi_msm.render.camera import Shot
 from taichi_msm.render.config import INFINITY, Bytes, Doubles, Floats, Integers
 from taichi_msm.render.coverage import intersect_instrument
 from taichi_msm.render.geometry import NODE_STRIDE
@@ -41,68 +40,61 @@ CELLS_AROUND_POINT = 4
 NOT_VISIBLE = math.nan
 
 
-def locate_points(
-    scene: Scene, coordinates: Array, position: Array, view: View, instruments: Sequence[Solid] = ()
-) -> Sight:
+def locate_points(scene: Scene, coordinates: Array, shot: Shot) -> Sight:
     """Project material points, with coordinates as in `Labels`, shape (n, 2), and determine their occlusion."""
-    pixels, hidden = _track(scene, coordinates, position, view, instruments, as_flow=False)
+    pixels, hidden = _track(scene, coordinates, shot)
     return Sight(pixels, hidden.view(np.bool_))
 
 
-def compute_flow(
-    scene: Scene, coordinates: Array, position: Array, view: View, instruments: Sequence[Solid] = ()
-) -> Flow:
+def compute_flow(scene: Scene, coordinates: Array, shot: Shot) -> Flow:
     """Compute the optical flow from another frame, with these coordinates in its `Labels`, to this one."""
     shape = coordinates.shape[:2]
-    moved, hidden = _track(scene, coordinates.reshape(-1, 2), position, view, instruments, as_flow=True)
+    moved, hidden = _track(scene, coordinates.reshape(-1, 2), shot, as_flow=True)
     return Flow(moved.reshape(*shape, 2), hidden.reshape(shape) * np.uint8(255))
 
 
-def compute_stereo(
-    scene: Scene, labels: Labels, position: Array, view: View, instruments: Sequence[Solid] = ()
-) -> Flow:
+def compute_stereo(scene: Scene, labels: Labels, shot: Shot) -> Flow:
     """Compute the flow of the sheet and the instruments from a camera's picture to its companion's at the same time."""
-    companion = view.companion
-    assert companion is not None
-    flow, occlusion = compute_flow(scene, labels.coordinates, position, companion, instruments)
+    view = shot.view
+    assert view.companion is not None
+    companion_shot = shot._replace(view=view.companion)
+    flow, occlusion = compute_flow(scene, labels.coordinates, companion_shot)
     instrument_pixels = np.argwhere(labels.instrument)
     if len(instrument_pixels):
         y, x = instrument_pixels.T
         centres = instrument_pixels[:, ::-1].astype(np.float64) + 0.5
         pixels = view.undistort(centres)
-        depth = _instrument_depth(scene, pixels, view, instruments)
+        depth = _instrument_depth(scene, pixels, shot)
         # Pixels just outside an instrument's outline may show it, by rounding to f32.
         depth = np.where(depth < INFINITY, depth, labels.depth[y, x])
-        companion_pixels, hidden = _track(
-            scene, view.points(pixels, depth), position, companion, instruments, as_flow=False
-        )
+        companion_pixels, hidden = _track(scene, view.points(pixels, depth), companion_shot)
         flow[y, x] = np.where(np.isnan(companion_pixels), NO_FLOW, companion_pixels - centres)
         occlusion[y, x] = hidden * np.uint8(255)
     return Flow(flow, occlusion)
 
 
-def _instrument_depth(scene: Scene, pixels: Array, view: View, instruments: Sequence[Solid]) -> Array:
+def _instrument_depth(scene: Scene, pixels: Array, shot: Shot) -> Array:
     """Return the depth [m] of the nearest instrument at undistorted pixels, shape (n, 2); INFINITY without one."""
-    launches = Launches(bounded=lanes("f64") == 1)
-    uniforms = uni.view_uniforms(view._replace(lens=None), scene, instruments)
+    launches, count = Launches(bounded=lanes("f64") == 1), len(shot.instruments)
+    uniforms = uni.view_uniforms(shot.view._replace(lens=None), scene, shot.instruments)
     depth = launches.array(np.float64, len(pixels))
     launches.launch(
         _ray_kernel(scene.shapes), len(pixels), launches.upload(np.ascontiguousarray(pixels).ravel()),
-        launches.upload(uniforms), len(instruments), depth, rounds=len(instruments),
+        launches.upload(uniforms), count, depth, rounds=count,
     )  # fmt: skip
     launches.require_completion()
     return launches.download(depth)
 
 
 def _track(
-    scene: Scene, points: Array, position: Array, view: View, instruments: Sequence[Solid], *, as_flow: bool
+    scene: Scene, points: Array, shot: Shot, *, as_flow: bool = False
 ) -> tuple[NDArray[np.float32], NDArray[np.uint8]]:
     """Return the pixels of points, or with `as_flow` their flow, and their occlusion.
 
     The points are coordinates of material points, shape (n, 2), or points of instruments [m], shape (n, 3). For the
     flow from another frame, they are those at the centres of its pixels, row by row.
     """
-    total, is_material = len(points), points.shape[-1] == 2
+    total, is_material, view, instruments = len(points), points.shape[-1] == 2, shot.view, shot.instruments
     if total == 0:
         return np.empty((0, 2), np.float32), np.empty(0, np.uint8)
     rows, cols = scene.sheet.points
@@ -122,10 +114,9 @@ def _track(
     sizes[[uni.INSTRUMENT_COUNT, uni.WIDTH, uni.HEIGHT]] = len(instruments), width, height
     nodes, outlines = (launches.array(np.float64, n) for n in (rows * cols * NODE_STRIDE, cells * CELL_STRIDE))
     bounds = launches.array(np.int32, cells * BOUNDS_STRIDE)
+    position = np.ascontiguousarray(shot.positions, np.float64)
     with compilation_options(optimised=False):
-        _outline_cells(
-            np.ascontiguousarray(position, np.float64), uniforms, launches.upload(sizes), nodes, outlines, bounds
-        )
+        _outline_cells(position, uniforms, launches.upload(sizes), nodes, outlines, bounds)
     bins = build_bins(launches, bounds, cells, (width, height), bin_size)
     sizes[[uni.BIN_SIZE, uni.BINS_ACROSS, uni.WIDTH, uni.HEIGHT]] = bins.size, bins.columns, *scene.render.size
     is_simple = launches.array(np.uint8, bins.lengths.size)
@@ -139,13 +130,11 @@ def _track(
         int(as_flow), uniforms, launches.upload(sizes), nodes, outlines, bins.starts, bins.entries, is_simple,
         pixels, hidden,
     )  # fmt: skip
+    kernel = _kernel(view.lens_model, scene.shapes, is_material)
     # Iterations per point: one per cell, and one per triangle.
     rounds = 1 + 2 * (scene.render.refine + 1) ** 2
-    for chunk_start, chunk_size in launches.chunks(int(bins.lengths.max()), rounds):
-        kernel = _kernel(view.lens_model, scene.shapes, is_material)
-        launches.launch(
-            kernel, total, chunk_start, chunk_size, *arguments, rounds=chunk_size * rounds + len(instruments)
-        )
+    for start, size in launches.chunks(int(bins.lengths.max()), rounds):
+        launches.launch(kernel, total, start, size, *arguments, rounds=size * rounds + len(instruments))
     launches.require_completion()
     return launches.download(pixels).reshape(-1, 2), launches.download(hidden)
 

@@ -28,9 +28,10 @@ from taichi_msm.load.check import check_scene
 from taichi_msm.load.resolve import resolve
 from taichi_msm.model.plan import Plan
 from taichi_msm.model.surface import Surface, place_instruments, refine_surface, to_positions
+from taichi_msm.render.camera import Shot
 from taichi_msm.render.labels import Flow, FrameOutputs, Labels, Sight
 from taichi_msm.render.picking import pick
-from taichi_msm.render.renderer import Array, CameraLike, Renderer, Shot
+from taichi_msm.render.renderer import Array, CameraLike, Renderer
 from taichi_msm.render.texture import require_texture
 from taichi_msm.runs.player import Player, jpeg_data_url
 from taichi_msm.scene.scene import Scene

@@ -358,9 +358,8 @@ def measure_pictures(
         changed = _with_render(scene, refine=refine, supersample=supersample)
         memory -= cost.drawing_bytes(changed)
         if memory < 0:
-            study.notes.append(
-                f"drawing was not measured from refine {refine}, supersample {supersample} on, for lack of memory"
-            )
+            note = f"drawing was not measured from refine {refine}, supersample {supersample} on, for lack of memory"
+            study.notes.append(note)
             break
         drawing = Rasterizer(changed, texture)
         drawings.append(drawing)

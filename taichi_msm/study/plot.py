@@ -12,7 +12,6 @@ from typing import Any
 from matplotlib import style
 from matplotlib.axes import Axes
 from matplotlib.axis import Axis
-from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.layout_engine import ConstrainedLayoutEngine
 from matplotlib.lines import Line2D
@@ -87,7 +86,7 @@ def _figure(study: Study) -> Figure:
     width = TWO_COLUMN_WIDTH if len(study_panels) > 1 else ONE_COLUMN_WIDTH
     size = width, 4.2 * (layout.count(";") + 1) + 0.5
     figure = Figure(figsize=size, dpi=DPI, layout=ConstrainedLayoutEngine(w_pad=0.1, h_pad=0.1, wspace=0.05))
-    FigureCanvasAgg(figure)
+
     state = " (interrupted)" if study.status == "interrupted" else ""
     figure.suptitle(f"{printable(study.scene)}: speed against error{state}", x=0.01, ha="left", parse_math=False)
     versions = study.machine["versions"]

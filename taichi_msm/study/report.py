@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Iterator, Sequence
-from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -23,7 +22,7 @@ from taichi_msm.study.format import (
     format_timing,
     machine_summary,
 )
-from taichi_msm.study.result import DrawingMeasurement, Measurement, Reference, SteppingMeasurement, Study
+from taichi_msm.study.result import Measurement, Reference, SteppingMeasurement, Study, Timing
 from taichi_msm.system.compiler import compiler_label
 
 PICTURE_FILE, PAGE_FILE, RECORD_FILE = "study.png", "study.md", "study.json"
@@ -64,11 +63,10 @@ def study_record(study: Study) -> dict[str, Any]:
 def _as_data(value: Any) -> Any:
     if isinstance(value, Measurement):
         method = {"method": value.method} if isinstance(value, SteppingMeasurement) else {}
-        return {**method, **{key: _as_data(inner) for key, inner in vars(value).items() if key != "samples"}} | {
-            "seconds": asdict(value.seconds)
-        }
-    if isinstance(value, Reference):
-        return _as_data(asdict(value))
+        fields = {key: inner for key, inner in vars(value).items() if key != "samples"}
+        return _as_data({**method, **fields, "seconds": value.seconds})
+    if isinstance(value, (Reference, Timing)):
+        return _as_data(vars(value))
     if isinstance(value, dict):
         return {key: _as_data(inner) for key, inner in value.items()}
     if isinstance(value, (list, tuple)):
@@ -134,7 +132,7 @@ def format_page(study: Study) -> str:
             "## Drawing",
             "The most deformed frame, against a picture of high refinement and supersampling. The largest error is of "
             "any colour of any pixel, from 0 to 255.",
-            _drawings_table(study, study.drawing),
+            _table(study.drawing, DRAWING_COLUMNS, study.best_drawing),
         ]
     if study.points:
         blocks += _mesh_section(study)
@@ -160,10 +158,10 @@ def format_summary(study: Study) -> str:
     blocks = ["\n".join(lines)]
     if fastest:
         names = "method", "step", "error", "time of the scene"
-        blocks.append(_methods_table(study, fastest, {name: STEPPING_COLUMNS[name] for name in names}))
+        blocks.append(_table(fastest, {name: STEPPING_COLUMNS[name] for name in names}, study.best_stepping))
     if study.drawing:
         best_drawings = map(study.best_refinement, sorted({drawing.supersample for drawing in study.drawing}))
-        blocks.append(_drawings_table(study, [drawing for drawing in best_drawings if drawing]))
+        blocks.append(_table([drawing for drawing in best_drawings if drawing], DRAWING_COLUMNS, study.best_drawing))
     if study.points:
         blocks.append(_meshes_table(study))
     notes = [f"note: {printable(note)}" for note in study.notes]
@@ -231,7 +229,7 @@ def _stepping_section(study: Study) -> Iterator[str]:
             f"to {reference.steps_per_frame} steps a frame; its own error is about {format_number(reference.error)}. "
             f"The tolerance is {study.tolerance:g}."
         )
-    yield _methods_table(study, study.stepping, STEPPING_COLUMNS)
+    yield _table(study.stepping, STEPPING_COLUMNS, study.best_stepping)
     orders = [f"{method} {order:.2f}" for method, order in study.orders.items() if order is not None]
     if orders:
         yield f"Observed orders: {', '.join(orders)}."
@@ -257,14 +255,8 @@ def _explain_bounds(points: Sequence[ErrorMeasurement]) -> Iterator[str]:
         yield "An error with < is an approximate upper bound, as the reference is not accurate enough."
 
 
-def _methods_table(study: Study, points: Sequence[SteppingMeasurement], columns: Columns) -> str:
-    best = study.best_stepping
-    return format_table(points, columns, lambda each: "recommended" if each is best else "")
-
-
-def _drawings_table(study: Study, drawings: Sequence[DrawingMeasurement]) -> str:
-    best = study.best_drawing
-    return format_table(drawings, DRAWING_COLUMNS, lambda each: "recommended" if each is best else "")
+def _table(measurements: Sequence[Measurement], columns: Columns, best: Measurement | None) -> str:
+    return format_table(measurements, columns, lambda each: "recommended" if each is best else "")
 
 
 def _meshes_table(study: Study) -> str:

@@ -196,23 +196,15 @@ class Study:
         lines = []
         if (points := self.recommended_points) is not None and max(points) <= MAX_POINTS:
             # With a tolerance, a run finds the step for this mesh.
-            lines += [
-                "sheet:",
-                f"  points: {list(points)}",
-                "time:",
-                "  step: auto",
-                f"  tolerance: {self.tolerance:g}",
-            ]
+            lines += ["sheet:", f"  points: {list(points)}"]
+            lines += ["time:", "  step: auto", f"  tolerance: {self.tolerance:g}"]
         if (step := self.best_stepping) is not None:
             lines.append("time:")
             if self.settings["time"]["tolerance"] is not None:
                 lines.append("  tolerance: null")
-            lines += [
-                # All digits: a rounded step could exceed the stability limit.
-                f"  step: {step.step!r}",
-                f"  damping_difference: {step.damping_difference}",
-                f"  precision: {step.precision}",
-            ]
+            # All digits: a rounded step could exceed the stability limit.
+            lines += [f"  step: {step.step!r}", f"  damping_difference: {step.damping_difference}"]
+            lines.append(f"  precision: {step.precision}")
         if (drawn := self.best_drawing) is not None:
             lines += ["render:", f"  refine: {drawn.refine}", f"  supersample: {drawn.supersample}"]
         return lines

@@ -27,9 +27,9 @@ from distributed.utils import LoopRunner, silence_logging_cmgr
 from taichi_msm.errors import ExecutorError, LostExecutorError, StageProgressCallback
 from taichi_msm.images import use_copies
 from taichi_msm.scene.outputs import SWEEP_RECORD
-from taichi_msm.sweeps.runs import Outcome, RunTask, execute_run
+from taichi_msm.sweeps.runs import Outcome, RunTask, execute_run, missing_versions
 from taichi_msm.sweeps.spec import Sweep
-from taichi_msm.system.compiler import result_versions, versions
+from taichi_msm.system.compiler import versions
 
 # Time limit for the answer of a scheduler [s].
 MAX_WAIT_S = 10
@@ -44,7 +44,7 @@ class Inputs(WorkerPlugin):  # type: ignore[misc]  # that package has no types
         self.scene, self.directory = scene._replace(folder=scene.folder.absolute()), directory.absolute()
         self.home = Path.cwd()
         # Required versions of this package and its libraries, by name.
-        self.versions = result_versions(versions(), "cpu")
+        self.versions = versions()
         self._digests = {str(Path(path).absolute()): digest for path, digest in sweep.files.items()}
         self._contents = {digest: Path(path).read_bytes() for path, digest in self._digests.items()}
         self.error = ""  # reason why the worker cannot execute runs
@@ -83,10 +83,7 @@ class Inputs(WorkerPlugin):  # type: ignore[misc]  # that package has no types
         # Results in a worker's own directory would be lost.
         if not (self.directory / SWEEP_RECORD).is_file():
             return f"worker {worker.address} cannot access {self.directory}; choose an --out that all machines share"
-        installed = versions()
-        if missing := [
-            f"{name} {version}" for name, version in self.versions.items() if installed.get(name) != version
-        ]:
+        if missing := missing_versions(self.versions):
             return f"worker {worker.address} needs other versions; install {', '.join(missing)}"
         return ""
 

@@ -67,7 +67,6 @@ def plot(data: PlotData, file: BinaryIO) -> None:
 
 
 def _figure(data: PlotData) -> Figure:
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
     from matplotlib.layout_engine import ConstrainedLayoutEngine
 
@@ -76,7 +75,6 @@ def _figure(data: PlotData) -> Figure:
     width = max(0.9 + PANEL_WIDTH_IN * len(parameters), ONE_COLUMN_WIDTH)
     height = 1.3 + 1.55 * len(data.results)
     figure = Figure(figsize=(width, height), dpi=DPI, layout=ConstrainedLayoutEngine(w_pad=0.06, h_pad=0.06))
-    FigureCanvasAgg(figure)
     figure.suptitle(printable(data.title), x=0.01, ha="left", parse_math=False)
     legend = textwrap.fill(" ".join(_legend(data, parameters)), round(CHARACTERS_PER_INCH * width))
     figure.supxlabel(legend, x=0.01, ha="left", size=8, parse_math=False)
@@ -433,12 +431,9 @@ def estimate_sensitivity(
     for name, column in results.items():
         is_finite = np.isfinite(column)
         if np.count_nonzero(is_finite) >= 64:  # Fewer are too inaccurate to rank parameters.
-            indices += [
-                SensitivityIndex(
-                    name, parameter.name, *first_order_index(parameter.numbers[is_finite], column[is_finite])
-                )
-                for parameter in parameters
-            ]
+            for parameter in parameters:
+                estimate = first_order_index(parameter.numbers[is_finite], column[is_finite])
+                indices.append(SensitivityIndex(name, parameter.name, *estimate))
     return indices
 
 

@@ -52,13 +52,8 @@ def _register(sweep: Sweep, directory: Path) -> list[list[Any]]:
         for name in (RUNS_FOLDER, *REPORT_FILES, RUN_RECORD):
             if (directory / name).exists():
                 raise errors.ForeignError.at(directory / name, "something")
-        content = {
-            "scene": sweep.settings.scene,
-            **description,
-            "keys": sweep.keys,
-            "versions": versions(),
-            "values": values,
-        }
+        content = {"scene": sweep.settings.scene, **description, "keys": sweep.keys}
+        content |= {"versions": versions(), "values": values}
         with errors.writing(directory), hidden_folder(directory) as hidden:
             (hidden / SWEEP_RECORD).write_text(json.dumps(content) + "\n", encoding="utf-8", errors="backslashreplace")
             link_without_replacing(hidden / SWEEP_RECORD, record)  # unless another shard was faster
@@ -68,7 +63,7 @@ def _register(sweep: Sweep, directory: Path) -> list[list[Any]]:
         # The limit bounds the memory for a foreign file.
         stored = json.loads(read_regular(record, max(1 << 28, 2 * len(expected_values))))
         earlier = {name: stored.get(name) for name in description}
-        stored_values, stored_versions = json.dumps(stored["values"]), result_versions(stored["versions"], "cpu")
+        stored_values, missing = json.dumps(stored["values"]), missing_versions(stored["versions"])
     except OSError as error:
         raise FilesError(f"{record}: {(error.strerror or str(error)).lower()}") from None
     except (ValueError, KeyError, TypeError, AttributeError, RecursionError):
@@ -80,15 +75,20 @@ def _register(sweep: Sweep, directory: Path) -> list[list[Any]]:
             noun = next(files, noun)
         message = f"holds the runs of another sweep: {noun} differs"
         raise SceneError([f"{directory}: {message}; choose another --out"])
-    current = result_versions(versions(), "cpu")
-    if required := [f"{name} {version}" for name, version in stored_versions.items() if version != current.get(name)]:
-        raise SceneError(
-            [f"{directory}: the sweep began with {', '.join(required)}; use these, or choose another --out"]
-        )
+    if missing:
+        message = f"the sweep began with {', '.join(missing)}; use these, or choose another --out"
+        raise SceneError([f"{directory}: {message}"])
     if stored_values != expected_values:
         message = "its values differ from those of the sweep file: damaged, or written with another SciPy"
         raise FilesError(f"{record}: {message}; choose another --out")
     return values
+
+
+def missing_versions(required: Mapping[str, str]) -> list[str]:
+    """List the required versions of packages that determine results, and are not installed here."""
+    installed = result_versions(versions(), "cpu")
+    needed = result_versions(required, "cpu").items()
+    return [f"{name} {version}" for name, version in needed if version != installed.get(name)]
 
 
 @dataclass
@@ -299,11 +299,8 @@ def _outcome_from_record(run: int, record: Mapping[str, Any]) -> Outcome:
     estimate = record["error_estimate"] or {}
     return _OUTCOME.validate_python(
         {
+            **record,
             "run": run,
-            "status": record["status"],
-            "error": record.get("error", ""),
-            "max_displacement": record["max_displacement"],
-            "shortest_spring": record["shortest_spring"],
             "error_estimate": estimate.get("error"),
             "mesh_error": estimate.get("mesh_error"),
             "forces": tuple(probe.get("greatest_force") for probe in record["probes"]),

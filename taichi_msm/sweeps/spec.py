@@ -7,7 +7,6 @@ import json
 import keyword
 import math
 import os
-import re
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import suppress
 from copy import deepcopy
@@ -89,11 +88,8 @@ class SweepSettings(Section):
         for name, distribution in variables.items():
             if name in {"run", *RESULT_COLUMNS, "seconds"}:
                 raise scene_fault("is the name of a column of table.csv; take another", name)
-            if (
-                name in {*FUNCTIONS, *CONSTANTS}
-                or keyword.iskeyword(name)
-                or not re.fullmatch(r"[A-Za-z_]\w*", name, re.A)
-            ):
+            is_identifier = name.isascii() and name.isidentifier() and not keyword.iskeyword(name)
+            if name in {*FUNCTIONS, *CONSTANTS} or not is_identifier:
                 raise scene_fault("is not a valid name; take letters, digits and _, such as x1", name)
             for value in distribution.values:
                 if isinstance(value, list) or not numbers(value):
@@ -413,11 +409,8 @@ def _unknown_keys(scene: scene_file.ParsedFile, vary: dict[str, Any], fixed: dic
         if not problem.is_unknown_key:
             continue
         # The unknown key is the beginning of a tried key, a key within its value, or a key of the scene file.
-        related = [
-            path
-            for path, key in keys.items()
-            if all(part == counterpart for part, counterpart in zip(key, problem.path, strict=False))
-        ]
+        unknown = problem.path
+        related = [path for path, key in keys.items() if key[: len(unknown)] == unknown[: len(key)]]
         for path in related or [("scene",)]:
-            prefix = f"{problem.key}: " if problem.path != keys.get(path) else ""
+            prefix = f"{problem.key}: " if unknown != keys.get(path) else ""
             yield Problem(path, f"{prefix}{problem.message}")

@@ -10,8 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from taichi_msm.model.surface import Solid
-from taichi_msm.render.camera import View, frozen_camera, orbit_camera, pinhole, view
-from taichi_msm.render.renderer import Renderer, Shot
+from taichi_msm.render.camera import Shot, View, frozen_camera, orbit_camera, pinhole, view
+from taichi_msm.render.renderer import Renderer
 from taichi_msm.runs.media import Picture
 from taichi_msm.scene.camera import Camera
 from taichi_msm.scene.render import AnyCamera, Render

@@ -12,10 +12,10 @@ from numpy.typing import NDArray
 from taichi_msm.model.sheet import rest_positions
 from taichi_msm.model.surface import Solid, place_instruments
 from taichi_msm.render import tracking
-from taichi_msm.render.camera import view
+from taichi_msm.render.camera import Shot, view
 from taichi_msm.render.labels import NO_FLOW, Labels, requested_labels
 from taichi_msm.render.rasterizer import Rasterizer, drawing_config
-from taichi_msm.render.renderer import Renderer, Shot
+from taichi_msm.render.renderer import Renderer
 from taichi_msm.render.tracking import compute_flow, locate_points
 from taichi_msm.scene.scene import Scene
 from taichi_msm.system import launches
@@ -70,7 +70,7 @@ def assert_labels_match_twin(made: Scene, position: Array) -> Labels:
     assert sheet.mean() > 0.2
     pixels, _ = twin.project(made, labels.coordinates[sheet].astype(float), position)
     assert np.abs(pixels - np.argwhere(sheet)[:, ::-1] - 0.5).max() < 0.01
-    flow, occlusion = compute_flow(made, labels.coordinates, position, view(made), placed)
+    flow, occlusion = compute_flow(made, labels.coordinates, Shot(position, view(made), placed))
     sheet = ~np.isnan(labels.coordinates[..., 0])
     assert np.abs(flow[sheet]).max() < (1e-3 if view(made).lens is None else 0.01)
     assert (flow[~sheet] == NO_FLOW).all()
@@ -91,7 +91,7 @@ def test_labels_match_the_twin(shape: Any, camera: Any, device: Device) -> None:
 def assert_tracks_match_twin(made: Scene, position: Array) -> NDArray[np.bool_]:
     """Compare pixels and occlusion of 2,000 points with the twin; return the occlusion."""
     coordinates = np.random.default_rng(9).uniform(0, 1, (2000, 2)).astype(np.float32)
-    tracks = locate_points(made, coordinates, position, view(made))
+    tracks = locate_points(made, coordinates, Shot(position, view(made)))
     pixels, hidden = twin.project(made, coordinates.astype(float), position)
     np.testing.assert_array_equal(np.isnan(tracks.pixels), np.isnan(pixels))
     near = np.abs(pixels).max(axis=1) < 1e4
@@ -114,15 +114,15 @@ def test_tracks_of_the_gpu_kernels(shape: Any, device: Device, monkeypatch: pyte
     """GPU kernels on the CPU, with the lists in one launch and in many, have the bits of those for the CPU."""
     made = with_instruments(drawable(camera="oblique", refine=2))
     position, coordinates = shape(made), np.random.default_rng(9).uniform(0, 1, (1000, 2)).astype(np.float32)
-    arguments = position, view(made), place_instruments(made, position, 0)
-    expected = locate_points(made, coordinates, *arguments)
+    shot = Shot(position, view(made), place_instruments(made, position, 0))
+    expected = locate_points(made, coordinates, shot)
     monkeypatch.setattr(tracking, "lanes", lambda precision: 1)
-    assert locate_points(made, coordinates[:0], *arguments).pixels.shape == (0, 2)
-    tracks = [locate_points(made, coordinates, *arguments)]
+    assert locate_points(made, coordinates[:0], shot).pixels.shape == (0, 2)
+    tracks = [locate_points(made, coordinates, shot)]
     # Two cells in a launch.
     monkeypatch.setattr(launches, "MAX_ROUNDS", launches.RESERVED_ROUNDS + 2 * (1 + 2 * 3**2))
     monkeypatch.setattr(launches, "VULKAN_THREADS", 100)
-    tracks.append(locate_points(made, coordinates, *arguments))
+    tracks.append(locate_points(made, coordinates, shot))
     for found in tracks:
         np.testing.assert_array_equal(found.pixels, expected.pixels)
         np.testing.assert_array_equal(found.hidden, expected.hidden)
@@ -134,7 +134,7 @@ def test_occlusion_by_instruments(device: Device) -> None:
     # At rest, from the top, 80 x 60 pixels show the 0.4 m x 0.3 m of the sheet.
     down, across = np.meshgrid((np.arange(60) + 0.5) / 60, (np.arange(80) + 0.5) / 80, indexing="ij")
     points = np.stack([across, down], axis=-1).reshape(-1, 2)
-    tracks = locate_points(made, points, position, view(made), place_instruments(made, position, 0))
+    tracks = locate_points(made, points, Shot(position, view(made), place_instruments(made, position, 0)))
     np.testing.assert_allclose(tracks.pixels, points * [80, 60], atol=1e-4)
     np.testing.assert_array_equal(tracks.hidden, (draw_labels(made, position).instrument == 255).ravel())
 
@@ -155,7 +155,7 @@ def test_flow_of_a_shifted_sheet(device: Device) -> None:
     rest = rest_positions(made.sheet)
     coordinates = draw_labels(made, rest).coordinates
     # 200 px/m.
-    flow, occlusion = compute_flow(made, coordinates, rest + np.array([0.01, 0.02, -0.1]), view(made))
+    flow, occlusion = compute_flow(made, coordinates, Shot(rest + np.array([0.01, 0.02, -0.1]), view(made)))
     np.testing.assert_allclose(flow, np.tile([2.0, -4.0], (60, 80, 1)), atol=1e-3)
     # The right two columns and the upper four rows leave the picture.
     outside = np.zeros((60, 80), bool)
@@ -176,6 +176,6 @@ def test_coordinates_at_an_edge(device: Device) -> None:
 
 def test_tracks_behind_the_eye(device: Device) -> None:
     made = drawable(camera={"eye": [0, 0, 0.02], "target": [0, 1, 0.02], "up": [0, 0, 1], "fov": 90})
-    tracks = locate_points(made, np.array([[0.5, 0.9], [0.5, 0.1]]), rest_positions(made.sheet), view(made))
+    tracks = locate_points(made, np.array([[0.5, 0.9], [0.5, 0.1]]), Shot(rest_positions(made.sheet), view(made)))
     np.testing.assert_array_equal(np.isnan(tracks.pixels[:, 0]), [True, False])
     assert tracks.hidden[0]

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from taichi_msm.model.sheet import rest_positions
 from taichi_msm.model.surface import Solid, place_instruments
 from taichi_msm.render import bins, gpu, tracking
-from taichi_msm.render.camera import view
+from taichi_msm.render.camera import Shot, view
 from taichi_msm.render.cpu import Bands
 from taichi_msm.render.labels import LABELS, track_grid
 from taichi_msm.render.rasterizer import Rasterizer, drawing_config
@@ -134,7 +134,7 @@ def test_cells_beyond_an_edge_of_the_picture_are_in_no_bin(device: Device, monke
     made = drawable((40, 40), camera={"eye": [0, 0, 0.1], "target": [0, 1, 0.1], "up": [0, 0, 1], "fov": 40})
     position = rest_positions(made.sheet)
     Rasterizer(made, speckle(13, 17), drawing_config(made)._replace(lanes=1)).draw(position)
-    tracking.locate_points(made, track_grid(2), position, view(made))
+    tracking.locate_points(made, track_grid(2), Shot(position, view(made)))
     assert not any(length.any() for length in lengths)
     assert len(lengths) == 2
 

@@ -20,7 +20,7 @@ from taichi_msm import run
 from taichi_msm.load.scene_file import load_scene
 from taichi_msm.model.sheet import rest_positions
 from taichi_msm.model.surface import place_instruments
-from taichi_msm.render.camera import view
+from taichi_msm.render.camera import Shot, view
 from taichi_msm.render.labels import requested_labels, track_grid
 from taichi_msm.render.rasterizer import Rasterizer, drawing_config
 from taichi_msm.render.tracking import compute_flow, locate_points
@@ -152,13 +152,15 @@ np.savez(sys.argv[1], **CASES[sys.argv[2]]())
 GROWTH = """
 import os
 from pathlib import Path
-from tests.render.test_vulkan import Rasterizer, drawable, locate_points, rest_positions, speckle, track_grid, view
+from tests.render.test_vulkan import (
+    Rasterizer, Shot, drawable, locate_points, rest_positions, speckle, track_grid, view,
+)
 from taichi_msm.system import runtime
 
 def memory():
     for _ in range(3):
         rasterizer.draw(position)
-        locate_points(made, track_grid(2), position, view(made))
+        locate_points(made, track_grid(2), Shot(position, view(made)))
     return int(Path("/proc/self/statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE")
 
 runtime.start("vulkan")
@@ -194,10 +196,10 @@ def draw_all(made: Scene, texture: NDArray[np.uint8]) -> dict[str, NDArray[Any]]
     result |= {name: value for name, value in labels._asdict().items() if value.size}
     shifted = position + np.array([0.002, 0.001, 0])
     result["flow"], result["occlusion"] = compute_flow(
-        made, labels.coordinates, shifted, camera, place_instruments(made, shifted, 0)
+        made, labels.coordinates, Shot(shifted, camera, place_instruments(made, shifted, 0))
     )
     rough = position + np.random.default_rng(5).normal(0, 0.004, position.shape)
-    result["pixels"], result["hidden"] = locate_points(made, track_grid(60), rough, camera, placed)
+    result["pixels"], result["hidden"] = locate_points(made, track_grid(60), Shot(rough, camera, placed))
     return result
 
 

@@ -170,7 +170,7 @@ def test_legends_of_the_figure() -> None:
 
     with style.context(STYLE, after_reset=True):
         figure = _figure(of_tissue())
-    figure.canvas.draw()
+    figure.draw_without_rendering()
     axes = {panel.get_title(loc="left"): panel for panel in figure.axes}
     assert list(axes) == ["Stepping", "Drawing", "Points"]
     legends = {name: legend for name in axes if (legend := axes[name].get_legend())}
