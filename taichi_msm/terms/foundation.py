@@ -76,7 +76,8 @@ class FoundationTerm(Term):
     @classmethod
     def node_stiffness_bounds(cls, material: Material, sheet: Sheet) -> NDArray[Any] | float:
         factors = 1.0 if material.virtual_factors is None else material.virtual_factors
-        return _steepest(material) * factors * (1.0 if material.shares is None or not material.by_area else material.shares)
+        areas = material.shares if material.by_area and material.shares is not None else 1.0
+        return _steepest(material) * factors * areas
 
     @property
     def column_places(self) -> Places:
