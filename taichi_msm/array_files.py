@@ -14,6 +14,8 @@ from taichi_msm.system.files import read_regular
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
+ARRAY_SUFFIXES = (".npy", ".npz")
+
 # Largest file, and largest array in it [bytes]: 4096 x 4096 points of three float64 numbers, with some margin.
 MAX_BYTES = 2**29
 
@@ -43,8 +45,8 @@ def read_array_file(
     remedy = f"save an array of numbers of shape {shapes} with numpy.save"
     try:
         array = _load(path, data, names)
-    except (ValueError, OSError, EOFError, KeyError, zipfile.BadZipFile, NotImplementedError, RuntimeError) as error:
-        raise PictureError(f"{path} is not an .npy or .npz file ({str(error).splitlines()[0]})", remedy) from None
+    except (ValueError, OSError, EOFError, zipfile.BadZipFile, NotImplementedError, RuntimeError):
+        raise PictureError(f"{path} is not an .npy or .npz file of numbers", remedy) from None
     if array.dtype.kind not in "fiu":
         raise PictureError(f"{path}: {array.dtype} is not numeric", remedy)
     if not is_shape(array.shape) or 0 in array.shape:

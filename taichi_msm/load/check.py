@@ -73,7 +73,9 @@ def _check_combinations(
 ) -> tuple[Plan | None, list[Problem]]:
     """Plan a scene, and check combinations of its keys; with `with_image`, also the image file."""
     plan, problems = try_plan(scene, maps)
-    problems += camera_problems(scene)
+    # Cameras look at the sheet at rest.
+    if plan is not None or scene.sheet.surface is None:
+        problems += camera_problems(scene)
     if "mp4" in scene.output and not outputs.is_pyav_installed():
         problems.append(Problem(("output",), outputs.PYAV_NOT_INSTALLED))
     if with_image:

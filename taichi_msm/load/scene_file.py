@@ -23,14 +23,15 @@ from taichi_msm.scene.section import MAX_PATH, format_value
 # Largest size of a file [bytes].
 MAX_BYTES = 2**20
 
-# Keys whose values are paths of pictures.
+# Keys whose values are paths of pictures, or of arrays of a surface.
 IMAGE_KEY: Key = ("image",)
 MAP_KEYS: tuple[Key, ...] = (
     ("tissue", "map", "image"),
     ("tissue", "foundation_map", "image"),
     ("springs", "map", "image"),
 )
-PICTURE_KEYS = (IMAGE_KEY, *MAP_KEYS)
+SURFACE_KEYS: tuple[Key, ...] = (("sheet", "surface", "height", "file"), ("sheet", "surface", "points", "file"))
+PICTURE_KEYS = (IMAGE_KEY, *MAP_KEYS, *SURFACE_KEYS)
 
 # Keys of a camera whose values are paths of files.
 CAMERA_FILE_KEYS = ("calibration", "poses")
@@ -115,7 +116,7 @@ def plan_file(
     )
     for override in parsed:
         draft.override(override)
-    for key in (*(PICTURE_KEYS if image is None else MAP_KEYS), *(key for key, _ in camera_files(draft.data))):
+    for key in (*PICTURE_KEYS[image is not None :], *(key for key, _ in camera_files(draft.data))):
         draft.resolve_path(key, file.folder)
     if image is not None:
         draft.override(Override(f"--image {truncate(str(image))}", IMAGE_KEY, str(image)))

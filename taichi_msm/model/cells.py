@@ -102,8 +102,7 @@ def sum_around_points(values: Array) -> Array:
     return padded[:-1, :-1] + padded[:-1, 1:] + padded[1:, :-1] + padded[1:, 1:]
 
 
-def point_normals(cells: Cells) -> Array:
-    """Return the unit normals at the mass points, shape (rows, cols, 3), along the sum of b x a of their cells."""
-    normals = sum_around_points(np.cross(cells.b, cells.a))
+def unit(vectors: Array) -> Array:
+    """Normalise vectors, shape (..., 3); a vector of length 0 becomes NaN."""
     with np.errstate(divide="ignore", invalid="ignore"):
-        return np.asarray(normals / np.linalg.norm(normals, axis=-1, keepdims=True))
+        return np.asarray(vectors / np.linalg.norm(vectors, axis=-1, keepdims=True))

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from taichi_msm.model.cells import Cells, point_normals, sum_around_points
+from taichi_msm.model.cells import Cells, sum_around_points, unit
 from taichi_msm.scene.sheet import Sheet
 from taichi_msm.scene.surface import Dome, HeightField, PointGrid, Tube
 
@@ -147,9 +147,14 @@ class CurvedRest(Rest):
         return sum_around_points(self.cells.area / 4)
 
     @cached_property
+    def cell_normals(self) -> Array:
+        """Unit normals of the cells, shape (rows - 1, cols - 1, 3); NaN for a cell without area."""
+        return unit(np.cross(self.cells.b, self.cells.a))
+
+    @cached_property
     def point_normals(self) -> Array:
-        """Unit normals at the mass points, shape (rows, cols, 3)."""
-        return point_normals(self.cells)
+        """Unit normals at the mass points, along the sum of b x a of their cells, shape (rows, cols, 3)."""
+        return unit(sum_around_points(np.cross(self.cells.b, self.cells.a)))
 
     def coordinates(self, fractions: Array) -> Array:
         return np.asarray(fractions, dtype=float)

@@ -238,7 +238,7 @@ def tissue_problems(scene: Scene, fixed: NDArray[np.bool_], factors: Array | Non
     if tissue is None:
         return
     aspect = cell_aspect_ratio(sheet)
-    if aspect > MAX_CELL_ASPECT * (1 + 1e-9):
+    if sheet.surface is None and aspect > MAX_CELL_ASPECT * (1 + 1e-9):
         (dx, dy), (rows, cols), (height, width) = spacing(sheet), sheet.points, sheet.size
         candidates = (
             (rows, math.ceil(width / dy / MAX_CELL_ASPECT) + 1),

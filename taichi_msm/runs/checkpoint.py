@@ -125,7 +125,7 @@ def read_manifest(directory: Path) -> tuple[Manifest, Plan]:
             raise FilesError(f"{path} {problem}; run the scene again, or continue with that version") from None
         raise _damaged(path) from None
     plan, problems = try_plan(manifest.scene)
-    if unreadable := [str(problem) for problem in problems if problem.path[-1:] == ("image",)]:
+    if unreadable := [str(problem) for problem in problems if problem.path[-1:] in (("image",), ("file",))]:
         raise SceneError(unreadable)
     numbers = () if manifest.estimate is None else asdict(manifest.estimate).values()
     is_valid = manifest.arch in ARCHS and all(number >= 0 for number in numbers)
@@ -150,6 +150,8 @@ def input_digests(plan: Plan) -> dict[str, str]:
     """
     scene = plan.scene
     sha256 = {**plan.sha256} | {f"{scene.kind}.{name}.image": image.sha256 for name, image in plan.maps.items()}
+    if scene.sheet.surface and (file := scene.sheet.surface.file):
+        sha256[".".join(("sheet", "surface", *scene.sheet.surface.file_key))] = file.sha256
     if scene.image is not None:
         with suppress(PictureError):
             sha256["image"] = file_sha256(scene.image)

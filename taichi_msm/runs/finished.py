@@ -201,6 +201,6 @@ def _read_scene(record: Mapping[str, Any]) -> Scene:
         scene = scene.with_pictures(lambda path: str(folder / path))
     problems = [*try_plan(scene)[1], *camera_problems(scene)]
     # Other problems are ignored: later methods check the pictures, and the step was valid with the original map.
-    if any(problem.path[-1:] != ("image",) and problem.path[0] != "time" for problem in problems):
+    if any(problem.path[-1:] not in (("image",), ("file",)) and problem.path[0] != "time" for problem in problems):
         raise SceneError([str(problem) for problem in problems])
     return scene

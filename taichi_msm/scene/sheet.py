@@ -6,7 +6,6 @@ import math
 from collections.abc import Collection, Mapping
 from typing import Annotated, Any, Literal
 
-import numpy as np
 from pydantic import Field, ValidationError, model_validator
 from typing_extensions import Self
 
@@ -65,23 +64,24 @@ class Sheet(Section):
 
     @model_validator(mode="before")
     @classmethod
-    def _measure_point_grid(cls, data: Any) -> Any:
-        """Add the size, and unless it is given the number of points, of the file of `surface.points`."""
+    def _complete_point_grid(cls, data: Any) -> Any:
+        """Add to `surface.points` the number of points of its file, unless it is given, and an unused size."""
         surface = data.get("surface") if isinstance(data, Mapping) else None
         grid = surface.get("points") if isinstance(surface, Mapping) else getattr(surface, "points", None)
         if grid is None:
             return data
         if "size" in data:
             raise scene_fault("conflicts with surface.points, whose size is that of its points; remove size", "size")
-        try:
-            positions = (grid if isinstance(grid, PointGrid) else PointGrid.model_validate(grid)).points.values
-        except PictureError as error:
-            raise scene_fault(str(error), "surface", "points", "file") from None
-        except ValidationError:
-            # The faults of the section come alone.
-            return {"points": (2, 2), **data, "size": (1.0, 1.0)}
-        width, height = np.maximum(np.ptp(positions[..., :2], axis=(0, 1)), 1e-30).tolist()
-        return {"points": positions.shape[:2], **data, "size": (height, width)}
+        points = data.get("points")
+        if points is None:
+            try:
+                grid = grid if isinstance(grid, PointGrid) else PointGrid.model_validate(grid)
+                points = grid.points.values.shape[:2]
+            except PictureError as error:
+                raise scene_fault(str(error), "surface", "points", "file") from None
+            except ValidationError:
+                points = (2, 2)  # The faults of the section come alone.
+        return {**data, "points": points, "size": (1.0, 1.0)}
 
     @model_validator(mode="after")
     def _check_surface(self) -> Self:
@@ -89,7 +89,7 @@ class Sheet(Section):
         if surface is None:
             return self
         if surface.points:
-            # A copy measures the points again.
+            # It is not given.
             self.__pydantic_fields_set__.discard("size")
         if surface.tube and width > 2 * math.pi * abs(surface.tube.radius):
             text = f"{surface.tube.radius:g} m is too small to roll {width:g} m; take {_radius(width / 2 / math.pi)}"

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection
+from collections.abc import Callable, Collection
 from functools import cached_property
 from typing import Annotated, Literal
 
@@ -157,6 +157,21 @@ class Surface(Section):
 
     def _unused_keys(self) -> Collection[str]:
         return [name for name, value in self if value is None]
+
+    @property
+    def path(self) -> str:
+        """Path of the file; empty for a kind without one."""
+        section = self.height or self.points
+        return section.file if section else ""
+
+    def with_path(self, path: Callable[[str], str]) -> Surface:
+        """Return a copy with the path p of the file, if the kind has one, replaced by `path(p)`."""
+        section = self.height or self.points
+        return (
+            self.model_copy(update={self.kind: section.model_copy(update={"file": path(section.file)})})
+            if section
+            else self
+        )
 
     @model_validator(mode="after")
     def _check_one_kind(self) -> Self:

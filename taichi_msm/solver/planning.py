@@ -22,6 +22,7 @@ from taichi_msm.errors import ArgumentError, Problem, SceneError
 from taichi_msm.images import PictureError
 from taichi_msm.integrators import INTEGRATORS
 from taichi_msm.model.plan import Plan, build_slots
+from taichi_msm.model.rest import rest_of
 from taichi_msm.model.sheet import (
     MapImage,
     Maps,
@@ -29,9 +30,9 @@ from taichi_msm.model.sheet import (
     fixed_points,
     material_key_problems,
     read_map,
-    spacing,
     tissue_problems,
 )
+from taichi_msm.model.surface_checks import surface_problems
 from taichi_msm.model.time_grid import TimeGrid
 from taichi_msm.model.tools import SolidTool, build_tools, path_problems, solid_tools
 from taichi_msm.scene.scene import Scene, Time
@@ -122,7 +123,7 @@ def try_plan(scene: Scene, maps: Maps | None = None) -> tuple[Plan | None, list[
     The keys of the scene are valid; checks across keys may fail. By default its stiffness maps are read from their
     files.
     """
-    problems = list(material_key_problems(scene))
+    problems = [*material_key_problems(scene), *surface_problems(scene)]
     if problems:
         return None, problems
     if maps is None:
@@ -233,11 +234,11 @@ def precision_problems(plan: Plan) -> Iterator[Problem]:
     """Check that lengths and gain are in the range of the precision."""
     if plan.grid.precision == "f64":
         return
-    cells, size, step, mass = spacing(plan.scene.sheet), plan.scene.sheet.size, plan.grid.step, plan.material.mass
-    if min(cells) < MIN_F32_LENGTH_M or max(size) > MAX_F32_LENGTH_M:
+    rest, step, mass = rest_of(plan.scene.sheet), plan.grid.step, plan.material.mass
+    if rest.shortest_side < MIN_F32_LENGTH_M or rest.extent > MAX_F32_LENGTH_M:
         yield Problem(
             ("sheet", "size"),
-            f"cells of {min(cells):g} m in a sheet of {max(size):g} m leave the range of f32, "
+            f"cells of {rest.shortest_side:g} m in a sheet of {rest.extent:g} m leave the range of f32, "
             f"{MIN_F32_LENGTH_M:g} to {MAX_F32_LENGTH_M:g} m; take time.precision: f64",
         )
     gain = step**2 / mass

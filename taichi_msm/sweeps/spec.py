@@ -19,6 +19,7 @@ from typing import Annotated, Any
 from pydantic import Field, field_validator, model_validator
 from typing_extensions import Self
 
+from taichi_msm.array_files import ARRAY_SUFFIXES
 from taichi_msm.errors import ArgumentError, Key, Problem, SceneError, truncate
 from taichi_msm.images import PICTURE_SUFFIXES, PictureError, file_sha256
 from taichi_msm.load import scene_file
@@ -365,7 +366,8 @@ def _matching_files(pattern: str, folder: Path, key: Key) -> list[str]:
     # `glob` calls itself for each folder, and takes quadratic time for brackets.
     if len(pattern) > MAX_PATH or pattern.count("/") > MAX_FOLDERS:
         return []
-    suffixes = PICTURE_SUFFIXES if key in scene_file.PICTURE_KEYS else ("",)
+    suffixes: tuple[str, ...] = PICTURE_SUFFIXES if key in scene_file.PICTURE_KEYS else ("",)
+    suffixes += ARRAY_SUFFIXES if key in scene_file.SURFACE_KEYS else ()
     names = sorted(glob(pattern, root_dir=folder))  # noqa: PTH207  # Path.glob refuses absolute patterns
     return [text for text in names if text.lower().endswith(suffixes) and (folder / text).is_file()]
 
