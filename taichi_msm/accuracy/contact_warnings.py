@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterator
 
 import numpy as np
@@ -10,7 +9,8 @@ from numpy.typing import NDArray
 
 from taichi_msm.arithmetic import NUMPY
 from taichi_msm.model.plan import Plan
-from taichi_msm.model.sheet import rest_positions, spacing
+from taichi_msm.model.rest import rest_of
+from taichi_msm.model.sheet import rest_positions
 from taichi_msm.model.tools import SolidTool, solid_tools
 from taichi_msm.solver.state import RunProgress
 
@@ -31,7 +31,7 @@ def tool_contact_warnings(plan: Plan, progress: RunProgress) -> Iterator[str]:
             )
     for tool in solid_tools(plan.tools).values():
         if tool.probe == progress.pierced_by - 1:
-            time, cell = progress.pierced_frame / plan.grid.frames_per_second, max(spacing(plan.scene.sheet))
+            time, cell = progress.pierced_frame / plan.grid.frames_per_second, rest_of(plan.scene.sheet).longest_side
             yield (
                 f"probes.{tool.probe}: the instrument went through the sheet, first at {time:.6g} s, frame "
                 f"{progress.pierced_frame}: its axis passes between points, which are {cell:.3g} m apart at "
@@ -95,4 +95,4 @@ def _stiffnesses(plan: Plan) -> tuple[float, float]:
     factor, foundation_factor = (
         1.0 if each is None else float(each.mean()) for each in (material.factors, material.virtual_factors)
     )
-    return factor * membrane, foundation_factor * material.virtual / math.prod(spacing(scene.sheet))
+    return factor * membrane, foundation_factor * material.virtual / rest_of(scene.sheet).cell_area

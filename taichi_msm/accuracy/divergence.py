@@ -10,7 +10,7 @@ import numpy as np
 from taichi_msm.accuracy.contact_warnings import first_piercing_probe
 from taichi_msm.model.loads import LoadBounds
 from taichi_msm.model.plan import Plan
-from taichi_msm.model.sheet import spacing
+from taichi_msm.model.rest import rest_of
 from taichi_msm.solver.state import LargestDisplacement, Reading, RunProgress, largest_displacement
 from taichi_msm.terms import TERMS
 from taichi_msm.terms.foundation import FoundationTerm, foundation_energy, point_shares
@@ -31,7 +31,7 @@ def displacement_bound(
     """
     # Deformation moves a mass point by at most ten sizes of the sheet; a tool moves the tissue that it holds along its
     # path.
-    bound = 10.0 * max(plan.scene.sheet.size) + sum(tool.reach for tool in plan.tools)
+    bound = 10.0 * rest_of(plan.scene.sheet).extent + sum(tool.reach for tool in plan.tools)
     # Springs along rows and columns connect every mass point to a held one. Shear springs alone may connect only half.
     if plan.is_held and min(plan.material.across, plan.material.down) > 0:
         return bound
@@ -143,7 +143,7 @@ class DivergenceMonitor:
         point, distance, energy = f"point ({extreme.row}, {extreme.column})", extreme.distance, reading.energy
         # The negated comparisons also detect NaN, for which every comparison is false.
         if not distance <= displacement_bound(self._plan, end, self._acceleration, self._tool_energy):
-            size = max(self._plan.scene.sheet.size)
+            size = rest_of(self._plan.scene.sheet).extent
             return f"{point} is {distance:g} m from its rest position, and the sheet is {size:g} m long"
         bound = self._energy_bound(begin, end)
         if not energy < math.inf or energy > bound:
@@ -189,7 +189,7 @@ def _tool_energy_bound(plan: Plan) -> float:
 def _underflow_energy(plan: Plan) -> float:
     """Return the energy below which the squares in its sum may underflow [J]."""
     tiny = float(np.finfo(np.float32 if plan.grid.precision == "f32" else np.float64).tiny)
-    (dx, dy), material = spacing(plan.scene.sheet), plan.material
+    (dx, dy), material = rest_of(plan.scene.sheet).cell_sides, plan.material
     inertia = material.mass / plan.grid.step**2
     # The sums contain squares with and without a factor of stiffness.
     springs = max(1.0, sum(term.stiffness_bound(material, plan.scene.sheet) for term in TERMS)) * (dx**2 + dy**2)

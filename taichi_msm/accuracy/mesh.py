@@ -42,7 +42,8 @@ from taichi_msm.accuracy.companions import SECOND_CELL_RATIO
 from taichi_msm.accuracy.time_step import max_norm
 from taichi_msm.errors import DivergedError, Pause, ProgressCallback, SceneError
 from taichi_msm.model.plan import Plan
-from taichi_msm.model.sheet import MAX_CELL_ASPECT, Maps, cell_aspect_ratio, spacing
+from taichi_msm.model.rest import rest_of
+from taichi_msm.model.sheet import MAX_CELL_ASPECT, Maps, cell_aspect_ratio
 from taichi_msm.model.tool_force import sum_probe_forces
 from taichi_msm.model.tools import overlap, solid_tools
 from taichi_msm.scene.scene import Scene
@@ -178,7 +179,7 @@ class MeshCompanion:
         self._differences = [0.0 for _ in plans]
         self._sampling_error = _sampling_force_error(plan.scene)
         self._contact, self._grips = plan.has_contact, any(tool.grips for tool in plan.tools)
-        cell = max(spacing(plan.scene.sheet))
+        cell = rest_of(plan.scene.sheet).longest_side
         narrow = [tool for tool in solid_tools(plan.tools).values() if tool.radius < MIN_RADIUS_CELLS * cell]
         overlaps = overlap(plan.tools, plan.scene.time.duration) is not None
         # Reason for an unknown error that does not depend on the companion runs.

@@ -75,7 +75,7 @@ class PathDependence:
 
     def _load_change(self, frame: int) -> float:
         """Return the relative change of loads and tools since the previous frame; 0 if a grip begins or ends."""
-        change, rate, size = 0.0, self._plan.grid.frames_per_second, max(self._plan.scene.sheet.size)
+        change, rate, size = 0.0, self._plan.grid.frames_per_second, rest_of(self._plan.scene.sheet).extent
         for load, peak in self._loads:
             (before, start), (after, end) = (load.at(each, rate) for each in (frame - 1, frame))
             change += abs(after - before) / peak + float(np.linalg.norm(end - start)) / size

@@ -26,11 +26,12 @@ from taichi_msm.accuracy.mesh import (
     mesh_companion_plan,
     with_points,
 )
+from taichi_msm.accuracy.surface import surface_notes
 from taichi_msm.accuracy.time_step import TimeStepCompanion, TimeStepEstimate, combine_estimates
 from taichi_msm.errors import Pause, ProgressCallback
 from taichi_msm.model import tool_force
 from taichi_msm.model.plan import Plan
-from taichi_msm.model.sheet import spacing
+from taichi_msm.model.rest import rest_of
 from taichi_msm.model.tool_force import ProbeRecord
 from taichi_msm.model.tools import COARSE_TIP_PHRASE, MAX_POINTS_RATIO, path_warnings, solid_tools
 from taichi_msm.scene.section import MAX_POINTS
@@ -189,7 +190,9 @@ class RunErrorEstimator:
             return ForceEstimate(None, NOT_CONVERGED)
         smallest = MIN_FORCE_ERROR_FACTOR * mesh.error
         if radii := [tool.radius for tool in solid_tools(self._plan.tools).values() if tool.grips]:
-            smallest = min(smallest, GRIP_FORCE_ERROR_FACTOR * max(spacing(self._plan.scene.sheet)) / min(radii))
+            smallest = min(
+                smallest, GRIP_FORCE_ERROR_FACTOR * rest_of(self._plan.scene.sheet).longest_side / min(radii)
+            )
         relative = max(relative, smallest)
         if not self._plan.has_contact:
             return ForceEstimate(relative)
@@ -232,6 +235,7 @@ def run_warnings(
             yield f"force error not known: {force.doubt}"
         else:
             yield f"force error at most about {_percent(force.error, 2)} % of the greatest force"
+    yield from surface_notes(scene)
     yield from tool_force.force_warnings(scene, probes)
     tool_warnings = list(path_warnings(scene, plan.tools))
     yield from tool_warnings

@@ -116,6 +116,7 @@ def _require_no_settings(context: click.Context, action: str, allowed: Sequence[
 @options.json_option
 def check(scene: str, image: str | None, overrides: tuple[str, ...], as_json: bool) -> None:
     """Validate SCENE, and print the steps, time, memory and disk space that it needs."""
+    from taichi_msm.accuracy.surface import describe_surface, surface_notes, surface_record
     from taichi_msm.load import cost
     from taichi_msm.load.scene_file import load_plan
     from taichi_msm.model.tool_force import describe_forces, force_warnings, probe_records
@@ -139,8 +140,15 @@ def check(scene: str, image: str | None, overrides: tuple[str, ...], as_json: bo
         "disk": budget.disk_bytes,
         "disk_while_running": budget.disk_bytes + budget.working_bytes,
         "probes": (records := probe_records(loaded)),
-        "notes": [*force_warnings(loaded, records), *path_warnings(loaded, plan.tools), *drawing_warnings(loaded)],
+        "notes": [
+            *surface_notes(loaded),
+            *force_warnings(loaded, records),
+            *path_warnings(loaded, plan.tools),
+            *drawing_warnings(loaded),
+        ],
     }
+    if surface := surface_record(loaded):
+        report["surface"] = surface
     if as_json:
         common.print_json(report)
         return
@@ -165,7 +173,7 @@ def check(scene: str, image: str | None, overrides: tuple[str, ...], as_json: bo
     )
     forces = enumerate(map(describe_forces, records))
     lines = [f"probes.{index}: {description}" for index, description in forces if description]
-    for line in (*describe_cameras(loaded), *lines, *report["notes"]):
+    for line in (*describe_surface(plan), *describe_cameras(loaded), *lines, *report["notes"]):
         click.echo(line)
 
 

@@ -10,6 +10,7 @@ from taichi_msm.fitting.observation import Array, Observation
 from taichi_msm.fitting.parameters import Parameter
 from taichi_msm.fitting.points import ROUNDING_SHARE
 from taichi_msm.fitting.predict import Prediction
+from taichi_msm.model.rest import rest_of
 from taichi_msm.scene.scene import Scene
 from taichi_msm.scene.section import FRAME_TOLERANCE
 
@@ -39,7 +40,7 @@ def faults_at_start(
     change sign, skips that of signs.
     """
     rate, motion, name = scene.time.frames_per_second, float(initial.motion.max()), observations[0].name
-    if motion <= ROUNDING_SHARE * max(scene.sheet.size):
+    if motion <= ROUNDING_SHARE * rest_of(scene.sheet).extent:
         yield f"{name}: none of its points moves in the scene; add probes that press near them"
         return
     times = np.concatenate([observed.time for observed in observations])

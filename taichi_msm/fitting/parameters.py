@@ -18,6 +18,7 @@ from typing_extensions import TypedDict
 
 from taichi_msm.errors import MAX_WORKERS, ArgumentError, Key, SceneError, did_you_mean
 from taichi_msm.load.scene_file import parse_key
+from taichi_msm.model.rest import rest_of
 from taichi_msm.scene.scene import Scene
 
 # Sections with fittable numbers, and keys that are not fittable: options, array sizes, and keys without effect.
@@ -180,14 +181,14 @@ def _default_range(scene: Scene, path: Key) -> float:
             return float(scene.render.size[last == "cy"])
         # Degrees, coefficients and directions have a range of 1.
         has_unit_range = any(part in ("fov", "distortion", "rotation", "up") for part in path[2:])
-        return 1.0 if has_unit_range else max(scene.sheet.size)
+        return 1.0 if has_unit_range else rest_of(scene.sheet).extent
     if "offset" in path:
         return 1.0
     if "load" in path:
         return 100.0 if last == 1 else time
     if "path" in path:
         # A keyframe is [t, across, down, height].
-        return (time, 1.0, 1.0, 0.1 * max(scene.sheet.size))[int(last)]
+        return (time, 1.0, 1.0, 0.1 * rest_of(scene.sheet).extent)[int(last)]
     # `at` is a position, or a list of keyframes [t, across, down].
     return time if len(path) == 5 and last == 0 else 1.0
 

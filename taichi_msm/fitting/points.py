@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 from taichi_msm.fitting import observation, rejection
 from taichi_msm.fitting.observation import Array, ErrorCorrelation, Observation, ObservationModel
 from taichi_msm.fitting.panels import Panel, plot_match, plot_motion, plot_on_sheet
+from taichi_msm.model.rest import rest_of
 from taichi_msm.model.surface import surface_weights
 from taichi_msm.render.camera import view_at
 from taichi_msm.runs.simulation import Simulation
@@ -298,7 +299,7 @@ class Positions(PointObservation):
     def conventions(self, scene: Scene) -> Conventions:
         """Return the conventions of positions."""
         return Conventions(
-            MAX_OFFSET_SHARE * max(scene.sheet.size),
+            MAX_OFFSET_SHARE * rest_of(scene.sheet).extent,
             "they are at rest in the scene",
             "count from the sheet's middle, x right, y up, z toward the viewer",
             ("-x, positive right of the middle", "-y, positive above the middle"),
@@ -338,7 +339,7 @@ class Pixels(PointObservation):
         return np.stack(pixels, axis=1)
 
     def backward(self, scene: Scene, points: Array, gradient: Array) -> Array:
-        steps = 1e-6 * max(scene.sheet.size) * np.eye(3)
+        steps = 1e-6 * rest_of(scene.sheet).extent * np.eye(3)
         changes = (
             (self.observe(scene, points + step) - self.observe(scene, points - step)) / (2 * step.sum())
             for step in steps

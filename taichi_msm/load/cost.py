@@ -61,6 +61,7 @@ RECORD_BYTES = 1 << 16  # run.json, without its scene
 
 # Force of a probe in a frame [bytes].
 FORCE_ROW_BYTES = 180  # row of forces.csv, upper bound
+REST_BYTES = 7 * 8  # position, area and normal of a mass point at rest
 FORCE_BYTES = 6 * 8  # values in the checkpoint
 
 # Numbers in memory per mass point.
@@ -79,6 +80,7 @@ class Budget:
     track_bytes: int  # memory for the tracks until the run ends, and size of their file
     picture_bytes: int  # upper bound of the size of the files with pictures and labels
     trajectory_bytes: int  # size of the file of positions
+    rest_bytes: int  # size of the file of a curved sheet at rest
     force_bytes: int  # upper bound of the size of the table of forces
     record_bytes: int  # upper bound of the size of run.json and camera.json
     working_bytes: int  # additional disk space until the run ends
@@ -91,7 +93,8 @@ class Budget:
     @property
     def disk_bytes(self) -> int:
         """Upper bound of the size of all results, without `working_bytes`."""
-        return self.picture_bytes + self.track_bytes + self.trajectory_bytes + self.force_bytes + self.record_bytes
+        files = self.picture_bytes, self.track_bytes, self.trajectory_bytes, self.rest_bytes, self.force_bytes
+        return sum(files) + self.record_bytes
 
 
 def step_entries(plan: Plan, frames: int) -> dict[str, Any]:
@@ -133,6 +136,7 @@ def estimate_budget(plan: Plan) -> Budget:
         track_bytes=track_bytes,
         picture_bytes=math.ceil(frames * frame_bytes),
         trajectory_bytes=position_bytes + 8 * frames + FILE_BYTES if "trajectory" in scene.output else 0,
+        rest_bytes=REST_BYTES * points + FILE_BYTES if scene.sheet.surface else 0,
         force_bytes=force_rows * FORCE_ROW_BYTES + FILE_BYTES if "forces" in scene.output else 0,
         record_bytes=2 * len(scene.model_dump_json(indent=2)) + RECORD_BYTES,
         # Two states (the saved one and its replacement), and the positions and forces of all frames.

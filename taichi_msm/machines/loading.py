@@ -21,6 +21,7 @@ import numpy as np
 
 from taichi_msm.errors import SceneError
 from taichi_msm.machines.reader import Array, MachineTest
+from taichi_msm.model.rest import rest_of
 from taichi_msm.model.tools import SolidTool, build_tools, solid_tools
 from taichi_msm.scene.scene import Scene
 
@@ -194,7 +195,7 @@ def build_loading(
 
 def require_plausible_travel(loading: Loading, scene: Scene) -> None:
     """Raise a SceneError if the tool travels farther than ten sizes of the sheet, as it does in another unit."""
-    travel, side = float(loading.travel().max()), max(scene.sheet.size)
+    travel, side = float(loading.travel().max()), rest_of(scene.sheet).extent
     if travel > 10 * side:
         fault = f"depth: the tool travels {travel:.4g} m, and the sheet is {side:g} m long"
         remedy = "write the unit in the header, such as [mm], or in --columns 'depth=NAME, mm'"

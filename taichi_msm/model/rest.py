@@ -6,6 +6,7 @@ of a curved sheet. Between mass points a sheet at rest is bilinear; beyond its e
 
 from __future__ import annotations
 
+import math
 from abc import ABC, abstractmethod
 from collections.abc import Callable
 from functools import cached_property, lru_cache
@@ -14,7 +15,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from taichi_msm.model.cells import Cells, sum_around_points, unit
+from taichi_msm.model.cells import Cells, isotropy_errors, sum_around_points, unit
 from taichi_msm.scene.sheet import Sheet
 from taichi_msm.scene.surface import Dome, HeightField, PointGrid, Tube
 
@@ -38,6 +39,22 @@ class Rest(ABC):
     @abstractmethod
     def box(self) -> Array:
         """Lower and upper corner of the sheet's box [m], shape (2, 3)."""
+
+    @property
+    def sides(self) -> tuple[float, float]:
+        """Height and width of the sheet, on a curved one means of its lengths along columns and rows [m]."""
+        rows, cols = self.position.shape[:2]
+        return (rows - 1) * self.cell_sides[1], (cols - 1) * self.cell_sides[0]
+
+    @property
+    @abstractmethod
+    def outline(self) -> Array:
+        """Points whose convex hull contains the sheet [m], shape (n, 3)."""
+
+    @property
+    def diagonal(self) -> float:
+        """Length of the box's diagonal [m]."""
+        return math.hypot(*np.ptp(self.box, axis=0))
 
     @property
     def extent(self) -> float:
@@ -98,6 +115,18 @@ class FlatRest(Rest):
         return np.array([[-width / 2, -height / 2, 0.0], [width / 2, height / 2, 0.0]])
 
     @property
+    def sides(self) -> tuple[float, float]:
+        return self._size
+
+    @property
+    def outline(self) -> Array:
+        return self.position[[0, 0, -1, -1], [0, -1, 0, -1]]
+
+    @property
+    def diagonal(self) -> float:
+        return math.hypot(*self._size)
+
+    @property
     def extent(self) -> float:
         return max(self._size)
 
@@ -141,10 +170,19 @@ class CurvedRest(Rest):
     def box(self) -> Array:
         return np.stack([self.position.min(axis=(0, 1)), self.position.max(axis=(0, 1))])
 
+    @property
+    def outline(self) -> Array:
+        return self.position.reshape(-1, 3)
+
     @cached_property
     def areas(self) -> Array:
         """Area of every mass point [m2], shape (rows, cols)."""
         return sum_around_points(self.cells.area / 4)
+
+    @cached_property
+    def isotropy_errors(self) -> Array:
+        """Isotropy error of each cell, shape (rows - 1, cols - 1)."""
+        return isotropy_errors(self.cells)
 
     @cached_property
     def cell_normals(self) -> Array:

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from taichi_msm.errors import Key, Problem, SceneError
 from taichi_msm.lenses.model import MAX_RADIUS
+from taichi_msm.model.rest import rest_of
 from taichi_msm.model.surface import Solid
 from taichi_msm.render.lens import IDENTITY_LENS, Lens
 from taichi_msm.scene.camera import Camera
@@ -178,7 +179,8 @@ def _view_of(scene: Scene, time: float, name: str) -> View:
     elif isinstance(camera, Camera) and camera.beside is not None:
         result = _companion(camera, scene, _view_of(scene, time, camera.beside))
     else:
-        result = _pinhole(camera if isinstance(camera, Camera) else PRESET_CAMERAS[camera](scene), scene, time)
+        preset = camera if isinstance(camera, Camera) else PRESET_CAMERAS[camera](scene)
+        result = _pinhole(aim_camera(preset, scene), scene, time)
     if baseline:
         shift, matrix = baseline * result.axes[0], result.matrix.copy()
         matrix[:, 3] -= matrix[:, :3] @ shift
@@ -238,7 +240,7 @@ def camera_problems(scene: Scene) -> Iterator[Problem]:
 def _single_camera_problems(camera: Camera, scene: Scene, name: str) -> Iterator[Problem]:
     """Yield the problems of a camera, with keys relative to its section; the first may be the cause of the others."""
     if camera.beside is None:
-        yield from _extrinsics_problems(camera, scene)
+        yield from _extrinsics_problems(aim_camera(camera, scene), scene)
     else:
         yield from _placement_problems(camera, scene, name)
     if camera.distortion is not None and camera.outside == "refuse":
@@ -252,7 +254,7 @@ def _placement_problems(camera: Camera, scene: Scene, name: str) -> Iterator[Pro
         if fault := _rotation_fault(np.array(camera.rotation)):
             yield Problem(("rotation",), fault)
         key, distance = "translation", math.hypot(*camera.translation)
-    if distance > MAX_BASELINE_RATIO * max(scene.sheet.size):
+    if distance > MAX_BASELINE_RATIO * rest_of(scene.sheet).extent:
         message = f"moves the camera by more than {MAX_BASELINE_RATIO:g} times the size of the sheet"
         yield Problem((key,), f"{message}; take a smaller number, in metres")
 
@@ -366,8 +368,10 @@ def pinhole(scene: Scene, time: float = 0.0) -> Camera:
         return frozen_camera(camera, time)
     if camera != "top":
         return PRESET_CAMERAS[camera](scene)
-    half_height = scene.render.size[1] / 2 / _top_scale(scene)
-    return Camera(eye=(0.0, 0.0, half_height / math.tan(math.radians(OBLIQUE_FOV) / 2)), fov=OBLIQUE_FOV)
+    distance = scene.render.size[1] / 2 / _top_scale(scene) / math.tan(math.radians(OBLIQUE_FOV) / 2)
+    lower, upper = rest_of(scene.sheet).box.tolist()
+    x, y = ((a + b) / 2 for a, b in zip(lower[:2], upper[:2], strict=True))
+    return Camera(eye=(x, y, upper[2] + distance), target=(x, y, upper[2]), fov=OBLIQUE_FOV)
 
 
 def frozen_camera(camera: Camera, time: float) -> Camera:
@@ -381,8 +385,21 @@ def frozen_camera(camera: Camera, time: float) -> Camera:
     return Camera(eye=tuple(eye.tolist()), target=tuple(target.tolist()), up=tuple(axes[1].tolist()), **optics)
 
 
+def aim_camera(camera: Camera, scene: Scene) -> Camera:
+    """Return a camera with a target: without one, the point of a curved sheet at rest at the middle of the picture."""
+    if scene.sheet.surface is None or camera.eye is None or "target" in camera.model_fields_set:
+        return camera
+    return camera.model_copy(update={"target": tuple(_middle(scene).tolist())})
+
+
+def _middle(scene: Scene) -> Array:
+    """Return the middle of the sheet at rest [m], shape (3,)."""
+    rest = rest_of(scene.sheet)
+    return rest.place(rest.coordinates(np.array([[0.5, 0.5]])))[0]
+
+
 def orbit_camera(camera: Camera, right: float, up: float) -> Camera:
-    """Return a static camera turned about its target: `right` about the sheet's normal, `up` about its x axis [rad]."""
+    """Return a static camera turned about its target: `right` about the z axis, `up` about its own x axis [rad]."""
     eye, (across, _, toward), _ = extrinsics(camera, 0.0)
     rotation = _rotation(np.array([0.0, 0.0, 1.0]), right) @ _rotation(across, -up)
     new_eye = np.array(camera.target) + rotation @ np.subtract(eye, camera.target)
@@ -399,18 +416,21 @@ def _rotation(axis: Array, angle: float) -> Array:
 
 def _top_scale(scene: Scene) -> float:
     """Return the scale at which the sheet at rest fits the picture [px/m]."""
-    (height, width), (width_px, height_px) = scene.sheet.size, scene.render.size
-    return min(width_px / width, height_px / height)
+    (width, height, _), (width_px, height_px) = np.ptp(rest_of(scene.sheet).box, axis=0).tolist(), scene.render.size
+    return min(width_px / max(width, 1e-300), height_px / max(height, 1e-300))
 
 
 def _top(scene: Scene) -> View:
     """Return the orthographic view from above, with the sheet at rest centred and as large as the picture allows.
 
-    The height of the eye (depth 0) is the larger side of the sheet.
+    The height of the eye (depth 0) above the highest point is the larger side of the sheet, along x and y.
     """
-    (width_px, height_px), scale, distance = scene.render.size, _top_scale(scene), max(scene.sheet.size)
-    rows = [[scale, 0, 0, width_px / 2], [0, -scale, 0, height_px / 2], [0, 0, 0, 1], [0, 0, -1, distance]]
-    size, eye = np.array([width_px, height_px], float), np.array([0.0, 0.0, distance])
+    (width_px, height_px), scale, box = scene.render.size, _top_scale(scene), rest_of(scene.sheet).box
+    (x, y, _), distance = (box[0] + box[1]) / 2, float(np.ptp(box[:, :2], axis=0).max())
+    eye = np.array([x, y, box[1, 2] + distance])
+    rows = [[scale, 0, 0, width_px / 2 - scale * x], [0, -scale, 0, height_px / 2 + scale * y]]
+    rows += [[0, 0, 0, 1], [0, 0, -1, eye[2]]]
+    size = np.array([width_px, height_px], float)
     scales = np.array([scale, scale])
     return View(np.array(rows, dtype=float), 0.0, np.eye(3), eye, scales, size / 2, size, distance, pinhole=False)
 
@@ -435,7 +455,7 @@ def _pinhole_at(camera: Camera, scene: Scene, placement: Extrinsics) -> View:
         x, y = width_px / 2, height_px / 2
     rows = [focal_x * right + x * depth, -focal_y * up + y * depth, depth, depth]
     matrix = np.array([[*row, -row @ eye] for row in rows])
-    near, size = 1e-6 * math.hypot(*scene.sheet.size), np.array([width_px, height_px], float)
+    near, size = 1e-6 * rest_of(scene.sheet).diagonal, np.array([width_px, height_px], float)
     scale, centre = np.array([focal_x, focal_y]), np.array([x, y])
     lens = Lens(camera.distortion.model, camera.distortion.coefficients) if camera.distortion else None
     lens = None if lens == IDENTITY_LENS else lens
@@ -445,10 +465,12 @@ def _pinhole_at(camera: Camera, scene: Scene, placement: Extrinsics) -> View:
 def _fit(scene: Scene) -> Camera:
     """Return the preset fit: the sheet at rest fills the picture, except for a margin of 2 %.
 
-    In the camera's axes up and forward, from the sheet's centre, the upper edge is at (a, b) and the lower edge at
-    (-a, -b). From an eye at (-a b / d, -d) they have the tangents a / d and -a / d, so the sheet is centred. The lower
+    On a flat sheet, in the camera's axes up and forward, from the sheet's centre, the upper edge is at (a, b) and the
+    lower edge at (-a, -b). From an eye at (-a b / d, -d) they have the tangents a / d and -a / d, so the sheet is centred. The lower
     edge is the nearer one: half its width has the tangent width / 2 / (d - b).
     """
+    if scene.sheet.surface:
+        return _fit_points(scene)
     (height, width), (width_px, height_px) = scene.sheet.size, scene.render.size
     axes = _look_at_axes(OBLIQUE_DIRECTION.tolist(), (0, 0, 0), (0, 1, 0))
     a, b = height / 2 * axes[1, 1], -height / 2 * axes[2, 1]
@@ -459,16 +481,36 @@ def _fit(scene: Scene) -> Camera:
     return Camera(eye=tuple(eye.tolist()), target=tuple(target.tolist()), fov=OBLIQUE_FOV)
 
 
+def _fit_points(scene: Scene) -> Camera:
+    """Return the preset fit of a curved sheet.
+
+    An eye at (x, y, z) in the camera's axes sees all points X within the tangents -t to t if |X - x| <= t (z - Z): on
+    each side the largest t Z + X bounds t z + x, and likewise the lower bound. The nearest eye meets both bounds of the
+    tighter direction, and is centred in the other one.
+    """
+    rest, (width_px, height_px) = rest_of(scene.sheet), scene.render.size
+    axes = _look_at_axes(OBLIQUE_DIRECTION.tolist(), (0, 0, 0), (0, 1, 0))
+    points = rest.position.reshape(-1, 3) @ axes.T
+    half_height = (1 - 2 * 0.02) * math.tan(math.radians(OBLIQUE_FOV) / 2)
+    tangents = half_height * np.array([width_px / height_px, 1.0])
+    right, left = (tangents * points[:, 2:] + sign * points[:, :2] for sign in (1, -1))
+    most, least = right.max(axis=0), left.max(axis=0)
+    depth = float(((most + least) / (2 * tangents)).max())
+    eye = np.array([*((most - least) / 2), depth]) @ axes
+    target = eye - (eye - _middle(scene)) @ axes[2] * axes[2]
+    return Camera(eye=tuple(eye.tolist()), target=tuple(target.tolist()), fov=OBLIQUE_FOV)
+
+
 def _oblique(scene: Scene) -> Camera:
     """Return the preset oblique: the sheet at rest fits into the picture, with a margin of 4 % in distance."""
-    (height, width), (width_px, height_px) = scene.sheet.size, scene.render.size
+    rest, (width_px, height_px) = rest_of(scene.sheet), scene.render.size
     toward = OBLIQUE_DIRECTION / np.linalg.norm(OBLIQUE_DIRECTION)
-    axes = _look_at_axes(toward.tolist(), (0, 0, 0), (0, 1, 0))
-    corners = np.array([[x, y, 0.0] for x in (-width / 2, width / 2) for y in (-height / 2, height / 2)]) @ axes.T
+    axes, middle = _look_at_axes(toward.tolist(), (0, 0, 0), (0, 1, 0)), rest.box.mean(axis=0)
+    corners = (rest.outline - middle) @ axes.T
     half_height = np.tan(np.radians(OBLIQUE_FOV) / 2)
     half = np.array([half_height * width_px / height_px, half_height])
     distance = float((corners[:, 2:] + np.abs(corners[:, :2]) / half).max()) * 1.04
-    return Camera(eye=tuple(distance * toward), fov=OBLIQUE_FOV)
+    return Camera(eye=tuple(middle + distance * toward), target=tuple(middle), fov=OBLIQUE_FOV)
 
 
 PRESET_CAMERAS = {"oblique": _oblique, "fit": _fit}

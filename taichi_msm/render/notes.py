@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from taichi_msm.lenses import MODELS
+from taichi_msm.model.rest import rest_of
 from taichi_msm.render import texture
 from taichi_msm.render.camera import View, is_moving, pair_transform, view_at
 from taichi_msm.scene.camera import Camera, Distortion
@@ -35,10 +36,10 @@ def drawing_warnings(scene: Scene) -> Iterator[str]:
                 f"probes.{index}.instrument: its shaft points down, through the sheet at rest; take the direction "
                 "from the tip to the hand, with z above 0"
             )
-        if instrument.outer_radius > 0.25 * max(scene.sheet.size):
+        if instrument.outer_radius > 0.25 * rest_of(scene.sheet).extent:
             yield (
                 f"probes.{index}.instrument: {instrument.outer_radius:g} m is a wide instrument for a sheet of "
-                f"{max(scene.sheet.size):g} m; the radius is in metres"
+                f"{rest_of(scene.sheet).extent:g} m; the radius is in metres"
             )
 
 
@@ -81,20 +82,24 @@ def _invisible_sheet(scene: Scene) -> Iterator[str]:
         centres = (np.arange(100) + 0.5) / 100
         pixels = camera.undistort(np.stack(np.meshgrid(*(centres * side for side in camera.size)), axis=-1))
         frames = range(scene.time.frames + 1 if is_moving(scene, name) else 1)
-        if not any(_is_visible(view_at(scene, frame / rate, name), pixels, scene.sheet.size) for frame in frames):
+        if not any(_is_visible(view_at(scene, frame / rate, name), pixels, scene) for frame in frames):
             key = _camera_key(name)
             yield f"{key} shows nothing of the sheet at rest, or only a dot, in all frames; lengths are in metres"
 
 
-def _is_visible(camera: View, pixels: NDArray[np.float64], size: tuple[float, float]) -> bool:
-    """Return whether any pixel [px], shape (..., 2), shows the sheet at rest, of `size` (height, width) [m]."""
+def _is_visible(camera: View, pixels: NDArray[np.float64], scene: Scene) -> bool:
+    """Return whether any of the pixels [px], shape (..., 2), shows the sheet at rest, or a point of a curved one."""
+    if scene.sheet.surface:
+        at = camera.pixels(rest_of(scene.sheet).outline)
+        is_inside = ((at > 0) & (at < camera.size)).all(axis=1)
+        return bool(is_inside.any()) and bool((np.ptp(at[is_inside], axis=0) > camera.size / 100).any())
     try:
         # The homography from the plane of the sheet to the picture, inverted.
         inverse = np.linalg.inv(camera.matrix[:3][:, [0, 1, 3]])
     except np.linalg.LinAlgError:
         return False
     x, y, inverse_w = np.moveaxis(pixels @ inverse[:, :2].T + inverse[:, 2], -1, 0)
-    height, width = size
+    height, width = scene.sheet.size
     # Pixels without a line of sight are NaN, and compare false.
     is_inside = (inverse_w > 0) & (np.abs(x) <= width / 2 * inverse_w) & (np.abs(y) <= height / 2 * inverse_w)
     return bool((is_inside & (inverse_w * camera.near < 1)).any())
@@ -103,7 +108,7 @@ def _is_visible(camera: View, pixels: NDArray[np.float64], size: tuple[float, fl
 def _stretched_picture(scene: Scene) -> Iterator[str]:
     """Warn of a picture that is stretched onto the sheet, with two remedies."""
     size = texture.image_size(scene)
-    if size is None:
+    if size is None or (scene.sheet.surface and scene.sheet.surface.points):
         return
     left, top, width, height = scene.region or (0, 0, *size)
     sheet_height, sheet_width = scene.sheet.size

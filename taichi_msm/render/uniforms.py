@@ -12,6 +12,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
+from taichi_msm.model.rest import rest_of
 from taichi_msm.model.surface import Solid
 from taichi_msm.render.camera import View
 from taichi_msm.render.undistortion import visible_region
@@ -94,7 +95,8 @@ def view_uniforms(
     view: View, scene: Scene, instruments: Sequence[Solid], supersample: int = 1, texture_size: tuple[int, int] = (1, 1)
 ) -> Array:
     """Return the array of uniforms of a view; `texture_size` is the width and height of the texture [texels]."""
-    render, sheet = scene.render, scene.sheet.size
+    render, rest = scene.render, rest_of(scene.sheet)
+    sides = rest.sides
     uniforms = np.zeros(INSTRUMENTS + len(instruments) * INSTRUMENT_STRIDE)
     uniforms[MATRIX:AXES] = (view.matrix * np.array([[supersample], [supersample], [1], [1]])).ravel()
     uniforms[AXES:NEAR] = view.axes.ravel()
@@ -111,9 +113,9 @@ def view_uniforms(
     uniforms[LIGHT_X:LIGHT_DISTANCE], uniforms[HEADLIGHT:ACROSS] = light_position, light_view.axes[2]
     uniforms[LIGHT_DISTANCE:HEADLIGHT] = light_distance, normalisation, light.ambient, light.gloss, light.vignette
     uniforms[ACROSS:UP], uniforms[UP:SLOPE_X] = view.axes[:, 0], view.axes[:, 1]
-    height = light.relief / 100 / 255 * max(sheet)
-    uniforms[SLOPE_X:DEPTH_TOLERANCE] = height * texture_size[0] / sheet[1], -height * texture_size[1] / sheet[0]
-    uniforms[DEPTH_TOLERANCE] = 1e-9 * max(sheet)
+    height = light.relief / 100 / 255 * rest.extent
+    uniforms[SLOPE_X:DEPTH_TOLERANCE] = height * texture_size[0] / sides[1], -height * texture_size[1] / sides[0]
+    uniforms[DEPTH_TOLERANCE] = 1e-9 * rest.extent
     if view.lens is not None:
         region = visible_region(view)
         set_lens(uniforms, view, supersample, region.radius)

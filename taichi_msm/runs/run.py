@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from taichi_msm.accuracy.companions import QUASISTATIC_REASON, CompanionRuns, choose_companion_runs
 from taichi_msm.accuracy.path_dependence import PathDependence
 from taichi_msm.accuracy.run_errors import RunErrorEstimates, RunErrorEstimator, run_warnings
+from taichi_msm.accuracy.surface import surface_record
 from taichi_msm.errors import (
     ArgumentError,
     DamagedError,
@@ -423,6 +424,7 @@ class _Run:
             "sha256": dict(manifest.sha256),
             "overrides": list(manifest.overrides),
             "points": list(scene.sheet.points),
+            **({"surface": surface} if (surface := surface_record(scene)) else {}),
             **cost.step_entries(plan, progress.frame),
             **({"residual": progress.residual, "evaluations": progress.evaluations} if scene.time.at_rest else {}),
             "max_displacement": progress.max_displacement,

@@ -16,8 +16,10 @@ from numpy.typing import NDArray
 from PIL import Image
 from typing_extensions import NotRequired
 
+from taichi_msm.accuracy.surface import SurfaceRecord
 from taichi_msm.errors import writing
 from taichi_msm.model.plan import Plan
+from taichi_msm.model.rest import CurvedRest, rest_of
 from taichi_msm.model.surface import surface_positions
 from taichi_msm.model.tool_force import ProbeRecord
 from taichi_msm.render.camera import calibration, is_moving, pair_transform, pose, view_at
@@ -64,6 +66,7 @@ class ResultWriter(AbstractContextManager["ResultWriter"]):
         self._finished = False
         self.encode_seconds = 0.0  # processor time of encoding pictures; valid after `finish`
         names = outputs.file_names(outputs.result_names(scene.folders), scene.time.frames + 1)
+        names += [outputs.REST_FILE] * (scene.sheet.surface is not None)
         with writing(directory), ExitStack() as opened:
             self._publication = opened.enter_context(Publication(directory, RUN_PUBLICATION, names))
             new_folder = self._publication.new_folder
@@ -128,6 +131,9 @@ class ResultWriter(AbstractContextManager["ResultWriter"]):
         self.finish()
         with writing(self._directory):
             results = outputs.result_names(self._scene.folders if self.frames else {})
+            if self._scene.sheet.surface:
+                self._write_rest()
+                results.insert(-1, outputs.REST_FILE)
             # By "outputs", the next run into the directory recognises the files that it may replace.
             complete_record = {**record, "frames": self.frames, "outputs": results}
             text = json.dumps(complete_record, indent=2, ensure_ascii=False, allow_nan=False) + "\n"
@@ -149,6 +155,13 @@ class ResultWriter(AbstractContextManager["ResultWriter"]):
         }
         with create_file(self._publication.new_folder / OUTPUTS["trajectory"].path()) as file:
             write_arrays(file, arrays)
+
+    def _write_rest(self) -> None:
+        """Write positions [m], areas [m2] and normals of the mass points at rest."""
+        rest = rest_of(self._scene.sheet)
+        assert isinstance(rest, CurvedRest)
+        with create_file(self._publication.new_folder / outputs.REST_FILE) as file:
+            write_arrays(file, {"position": rest.position, "area": rest.areas, "normal": rest.point_normals})
 
     def _write_forces(self) -> None:
         """Write the forces of all frames, as decimals that round-trip to float64."""
@@ -255,6 +268,7 @@ class RunRecord(TypedDict, total=False):
     sha256: dict[str, str]
     overrides: list[str]  # of the scene file
     points: list[int]  # rows and columns of mass points
+    surface: SurfaceRecord  # only of a sheet that is curved at rest
     step: float | None  # [s]; None if quasi-static
     stable_step: float | None  # largest stable step [s]; None if quasi-static or if every step is stable
     steps_per_frame: int | None  # None if quasi-static

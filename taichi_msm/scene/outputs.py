@@ -135,6 +135,10 @@ RESULT_PATTERNS = (
 )
 
 
+# Positions, areas and normals at rest of a curved sheet.
+REST_FILE = "rest.npz"
+
+
 def result_names(folders: Mapping[str, Collection[str]]) -> list[str]:
     """Return the results of a run, as in `outputs` of run.json, from the outputs of each folder (`Scene.folders`)."""
     selected = [(folder, output) for output in OUTPUTS.values() for folder in folders if output.name in folders[folder]]

@@ -16,6 +16,7 @@ from taichi_msm.load.check import check_scene
 from taichi_msm.load.resolve import resolve
 from taichi_msm.load.yaml_reader import MAX_NODES
 from taichi_msm.model.plan import Plan
+from taichi_msm.model.rest import rest_of
 from taichi_msm.model.surface import place_instrument, place_instruments, surface_point
 from taichi_msm.model.tool_force import probe_force
 from taichi_msm.model.tools import path_problems, path_warnings
@@ -488,7 +489,7 @@ class Session:
         percent = f"{action} {abs(tool.percent):.0f} %" if tool.percent else f"tool {tool.strength:.0f} %"
         displacement = self.displacement()
         # Smaller displacements are rounding errors of f32.
-        return [percent, format_length(displacement if displacement > 1e-6 * max(self.scene.sheet.size) else 0.0)]
+        return [percent, format_length(displacement if displacement > 1e-6 * rest_of(self.scene.sheet).extent else 0.0)]
 
 
 def _require_usable(scene: Scene, *, play: bool) -> None:

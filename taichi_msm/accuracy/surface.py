@@ -1,0 +1,110 @@
+"""How well the springs of a curved sheet approximate tissue: its record in run.json, notes, and lines of `check`."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+
+import numpy as np
+from typing_extensions import TypedDict
+
+from taichi_msm.model.cells import cell_stiffness
+from taichi_msm.model.plan import Plan
+from taichi_msm.model.rest import CurvedRest, rest_of
+from taichi_msm.model.surface_checks import describe_place, isotropy_remedy, neighbour_angles
+from taichi_msm.scene.scene import Scene
+from taichi_msm.terms import fictitious_masses
+from taichi_msm.terms.elasticity import spring_families
+
+# Notes warn from these on: mean isotropy error, angle between neighbouring cells, step of heights in sides of a cell.
+NOTED_ISOTROPY_ERROR, NOTED_ANGLE_DEGREES, NOTED_STEP = 0.1, 45.0, 1 / 20
+
+
+class IsotropyRecord(TypedDict):
+    """Isotropy errors of the cells, see `isotropy_errors`."""
+
+    mean: float  # over the area
+    worst: float
+
+
+class SurfaceRecord(TypedDict):
+    """A curved sheet at rest, as written to run.json."""
+
+    kind: str
+    sha256: str | None  # of the file
+    sides: list[float]  # shortest and longest mean side of a cell [m]
+    isotropy_error: IsotropyRecord
+    clamped: int  # number of cells with a spring whose stiffness would be negative
+    filled: float  # share of pixels without depth
+
+
+def surface_record(scene: Scene) -> SurfaceRecord | None:
+    """Return the record of a curved sheet at rest; None for a flat one."""
+    rest, surface = rest_of(scene.sheet), scene.sheet.surface
+    if not isinstance(rest, CurvedRest) or surface is None:
+        return None
+    errors, area, file = rest.isotropy_errors, rest.cells.area, surface.file
+    return {
+        "kind": surface.kind,
+        "sha256": file.sha256 if file else None,
+        "sides": [rest.shortest_side, rest.longest_side],
+        "isotropy_error": {"mean": float((errors * area).sum() / area.sum()), "worst": float(errors.max())},
+        "clamped": int(cell_stiffness(rest.cells, 1.0).is_clamped.sum()),
+        "filled": 0.0,
+    }
+
+
+def surface_notes(scene: Scene) -> Iterator[str]:
+    """Yield notes about cells, steps of heights and sharp folds of a curved sheet."""
+    rest, record, surface = rest_of(scene.sheet), surface_record(scene), scene.sheet.surface
+    if not isinstance(rest, CurvedRest) or record is None or surface is None:
+        return
+    isotropy, file, side = record["isotropy_error"], surface.file, min(rest.cell_sides)
+    if scene.tissue is not None and isotropy["mean"] > NOTED_ISOTROPY_ERROR:
+        yield (
+            f"sheet.surface: the springs deviate from isotropic tissue by {isotropy['mean']:.3g} on the mean, up to "
+            f"{isotropy['worst']:.3g}; {isotropy_remedy(rest)}"
+        )
+    if surface.height and file and file.step > NOTED_STEP * side:
+        yield (
+            f"sheet.surface: heights in steps of {file.step:.3g} m, over a twentieth of a cell's side, {side:.3g} m; "
+            "take a picture of 16 bits or an array"
+        )
+    angles = neighbour_angles(rest.cell_normals)
+    if (angle := float(angles.max())) > NOTED_ANGLE_DEGREES:
+        place = describe_place(angles == angle)
+        yield f"sheet.surface: cells at {place} meet at {angle:.0f} degrees; take more points, or a smoother surface"
+
+
+def describe_surface(plan: Plan) -> Iterator[str]:
+    """Yield lines about the cells of a curved sheet, the steps that they cost, and the pressure on a tense one."""
+    rest, record = rest_of(plan.scene.sheet), surface_record(plan.scene)
+    if not isinstance(rest, CurvedRest) or record is None:
+        return
+    cells, (rows, cols) = rest.cells, plan.scene.sheet.points
+    aspect = np.maximum(cells.side_a / cells.side_b, cells.side_b / cells.side_a)
+    angles, isotropy = np.degrees(np.arccos(cells.cosine)), record["isotropy_error"]
+    yield (
+        f"surface: {record['kind']}, {rows} x {cols} points, cells of {rest.shortest_side:.3g} to "
+        f"{rest.longest_side:.3g} m, at most {aspect.max():.3g} times as long as wide, at {angles.min():.0f} to "
+        f"{angles.max():.0f} degrees"
+    )
+    worst = describe_place(rest.isotropy_errors == rest.isotropy_errors.max())
+    line = f"surface: isotropy error {isotropy['mean']:.3g} on the mean, at most {isotropy['worst']:.3g}, at {worst}"
+    clamped = record["clamped"]
+    yield f"{line}; {clamped} cells are clamped, as a spring would need a stiffness below 0" if clamped else line
+    if not plan.scene.time.at_rest:
+        squares = fictitious_masses(plan.material, plan.scene.sheet)
+        if plan.material.by_area:
+            squares /= plan.area_shares
+        if (ratio := math.sqrt(float(squares.max() / np.median(squares)))) > 1.05:
+            yield f"surface: its smallest cells make the stable step {ratio:.2g} times shorter than its median cells"
+    if plan.material.is_tense:
+        pulls = np.zeros(rest.position.shape)
+        for family in spring_families(plan):
+            pull = family.tension[..., None] * family.offset
+            pulls[family.start] += pull
+            pulls[family.end] -= pull
+        pressures = np.abs((pulls * rest.point_normals).sum(axis=-1)) / rest.areas
+        largest = float(pressures[~plan.fixed].max(initial=0.0))
+        yield f"surface: at rest, a pressure of up to {largest:.4g} Pa holds the pretension"
