@@ -11,6 +11,7 @@ import pytest
 from numpy.typing import NDArray
 from PIL import Image
 from scipy.sparse.linalg import spsolve
+from skfem import Basis, BilinearForm, ElementQuad2, ElementVector, LinearForm, MeshQuad, condense, solve
 
 from taichi_msm.model.loads import average_loads, evaluate_frame_loads
 from taichi_msm.model.plan import Plan
@@ -23,6 +24,7 @@ from tests.reference import surface
 from tests.reference.contact import centre, lowest_point
 from tests.reference.dynamics import probe_force
 from tests.reference.loads import Loads, frame_loads, step_loads
+from tests.reference.rough import rough_frames
 from tests.reference.sheet import Sheet, highest_frequency, largest_pressure, sheet
 from tests.scenes import plan_of, random_scene, random_tissue, scene, speckle
 
@@ -161,6 +163,14 @@ def test_rectangles_and_rhombi_are_isotropic() -> None:
     assert surface.isotropy_error(long).max() > 0.5
 
 
+def test_summary_of_a_tube() -> None:
+    """Rectangles of chords across and of straight sides along, with an aspect ratio above sqrt(3)."""
+    measured = surface.summary(surface.rest_positions(TUBE, (5, 13), (0.04, 0.06)))
+    np.testing.assert_allclose(measured.sides, [0.05 * math.sin(0.1), 0.01], rtol=1e-12)
+    assert measured.clamped == 48
+    np.testing.assert_allclose(measured.mean, measured.worst)
+
+
 def test_poissons_ratio_of_rhombi_is_a_third() -> None:
     """A uniform plane strain of rhombi has the stress C11 = 9/8 E t, C12 = C66 = 3/8 E t at their springs."""
     rest = skewed((2, 2), 0.01, 0.01, 1.2)
@@ -254,6 +264,34 @@ def test_pressure_of_the_pretension(kind: Any) -> None:
     expected = 3 / 0.025 if kind is TUBE else 2 * 3 / 0.05
     # The error is of the order of the square of a cell's angle, and of the dome's anisotropy.
     np.testing.assert_allclose(largest_pressure(curved(made, kind), free), expected, rtol=0.01)
+
+
+def test_bound_of_a_cell_is_its_highest_eigenvalue() -> None:
+    """The Laplacian of four points joined by sides and diagonals; the bound takes the stiffer of two sides."""
+    rng = np.random.default_rng(2)
+    for _ in range(20):
+        rest, stiffness = skewed((2, 2), 1.0, *rng.uniform(0.5, 2.5, 2)), rng.exponential(size=4)
+        corners = rest.reshape(4, 3)
+        matrix = np.zeros((4, 4))
+        for family, (start, end) in zip(
+            (0, 0, 1, 1, 2, 3), ((0, 1), (2, 3), (0, 2), (1, 3), (0, 3), (1, 2)), strict=True
+        ):
+            ends = np.zeros(4)
+            ends[[start, end]] = 1, -1
+            matrix += stiffness[family] * ((corners[end] - corners[start]) ** 2).sum() * np.outer(ends, ends)
+        bound = surface.stiffness_bounds(rest, stiffness[None, None])
+        np.testing.assert_allclose(bound, np.linalg.eigvalsh(matrix)[-1], rtol=1e-12)
+
+
+def test_places_are_bilinear_and_go_on_outside() -> None:
+    """A bilinear function of across and down, at all fractions that a path may have."""
+    across, down = np.meshgrid(np.linspace(0, 1, 5), np.linspace(0, 1, 4))
+
+    def values(u: Any, v: Any) -> Array:
+        return np.stack([1 + u - 2 * v, u * v, 3 * v], axis=-1)
+
+    for u, v in ((0.3, 0.7), (0, 1), (1, 0), (1, 1), (-1, 0.5), (2, -1), (0.4, 2)):
+        np.testing.assert_allclose(surface.at_fractions(values(across, down), u, v), values(u, v), atol=1e-14)
 
 
 def test_frequencies_are_below_the_bound() -> None:
@@ -448,3 +486,86 @@ def test_equilibrium_of_a_dome_that_locks() -> None:
     # Where the slope of the foundation's law has grown to at least 4, half of the depth that locks.
     assert -(u * dome.normal).sum(axis=-1).min() > 0.0015
     assert reference.residual(made, u, loads, ~plan.fixed, dome) < 1e-12
+
+
+def dome_of_elements(probe: Probe, at: tuple[float, float], foundation: float, n: int) -> float:
+    """Work of a small load on a dome on a foundation [J]: quadratic elements on the exact surface, in plane stress."""
+    size = radius = 0.05
+
+    def place(x: Any, y: Any) -> Array:
+        ray = np.stack([np.tan(x / radius), np.tan(y / radius), 1 + 0 * x])
+        return radius * ray / np.sqrt((ray**2).sum(axis=0))
+
+    def frame(x: Array, y: Array) -> tuple[Array, ...]:
+        """Orthonormal axes e1, e2 of the tangent plane, and p, c, q: g_x = p e1, g_y = c e1 + q e2."""
+        d = 1e-9 * 1j
+        g_x, g_y = place(x + d, y).imag / 1e-9, place(x, y + d).imag / 1e-9
+        p = np.sqrt((g_x**2).sum(axis=0))
+        c = (g_x * g_y).sum(axis=0) / p
+        rest = g_y - c * g_x / p
+        q = np.sqrt((rest**2).sum(axis=0))
+        return g_x / p, rest / q, p, c, q
+
+    def strains(u: Any, e1: Array, e2: Array, p: Array, c: Array, q: Array) -> tuple[Array, Array, Array]:
+        d1, d2 = u.grad[:, 0] / p, u.grad[:, 1] / q - u.grad[:, 0] * c / (p * q)
+        shear = (e1 * d2 + e2 * d1).sum(axis=0) / 2
+        return (e1 * d1).sum(axis=0), (e2 * d2).sum(axis=0), shear
+
+    @BilinearForm  # type: ignore[untyped-decorator]
+    def form(u: Any, v: Any, w: Any) -> Any:
+        axes = frame(*w.x)
+        (u1, u2, u12), (v1, v2, v12) = strains(u, *axes), strains(v, *axes)
+        membrane = YOUNG * THICKNESS * (9 / 8 * (u1 * v1 + u2 * v2) + 3 / 8 * (u1 * v2 + u2 * v1 + 4 * u12 * v12))
+        return axes[2] * axes[4] * (membrane + foundation * (u * v).sum(axis=0))
+
+    middle = place(np.array((at[0] - 0.5) * size), np.array((0.5 - at[1]) * size))
+    reach = 1 / probe.falloff
+    integral = math.pi * probe.radius**2 + 2 * math.pi * (probe.radius * reach + reach**2)
+
+    @LinearForm  # type: ignore[untyped-decorator]
+    def load(v: Any, w: Any) -> Any:
+        _, _, p, _, q = frame(*w.x)
+        distance = np.sqrt(((place(*w.x) - middle[:, None, None]) ** 2).sum(axis=0))
+        decay = np.exp(-probe.falloff * np.maximum(distance - probe.radius, 0))
+        return p * q * decay / integral * sum(force * v[axis] for axis, force in enumerate(np.array(probe.total)))
+
+    lines = np.linspace(-size / 2, size / 2, n + 1)
+    basis = Basis(MeshQuad.init_tensor(lines, lines), ElementVector(ElementQuad2(), 3), intorder=6)
+    forces = load.assemble(basis)
+    return float(forces @ solve(*condense(form.assemble(basis), forces, D=basis.get_dofs())))
+
+
+def test_rough_tool_on_a_turned_surface() -> None:
+    """A ball that presses and drags; mass points stick to it."""
+    path = [[0, 0.5, 0.5, 0.0001], [1, 0.5, 0.5, -0.006], [2, 0.55, 0.45, -0.004]]
+    ball = {"path": path, "instrument": {**ROD, "radius": 0.02}, "friction": "rough"}
+    time = {"motion": "quasistatic", "precision": "auto", "duration": 2, "frames_per_second": 1}
+    made, away = (
+        moving((7, 7), [probe], tissue={"foundation": 1e6}, fixed="border", time=time) for probe in (ball, turned(ball))
+    )
+    rest = surface.flat_positions((7, 7), made.sheet.size)
+    expected = rough_frames(plan_of(made), np.zeros((7, 7, 3)))
+    actual = rough_frames(plan_of(away), np.zeros((7, 7, 3)), sheet(away, rest @ TURN.T))
+    for (u, force, stuck), (found, found_force, found_stuck) in zip(expected, actual, strict=True):
+        assert stuck.sum() >= 4
+        np.testing.assert_array_equal(found_stuck, stuck)
+        # Both end with Newton's method.
+        np.testing.assert_allclose(found @ TURN, u, rtol=0, atol=1e-10 * np.abs(u).max())
+        np.testing.assert_allclose(TURN.T @ found_force, force, rtol=0, atol=1e-9 * np.abs(force).max())
+
+
+@pytest.mark.slow
+def test_dome_matches_finite_elements() -> None:
+    """A dome with a fixed border, pressed off its middle along the normal there, on a foundation."""
+    at, foundation, work = (0.35, 0.6), 1e5, []
+    for points in (17, 33, 65):
+        made = tissue((points, points), foundation=foundation)
+        dome = curved(made, DOME)
+        along = surface.at_fractions(dome.rest, *at) + np.array([0, 0, 0.05])
+        probe = Probe.model_construct(total=tuple(-along / np.linalg.norm(along)), radius=0.008, falloff=300.0)
+        force, free = probe_force(probe, dome, *at).ravel(), np.repeat(~plan_of(made).fixed, 3)
+        stiffness = reference.stiffness(made, 0.0, 1.0, dome)[free][:, free]
+        work.append(float(force[free] @ spsolve(stiffness, force[free])))
+    # The elements are within 0.01 %: 0.0115609 J with 32 a side, 0.0115602 J with 48.
+    errors = np.abs(np.array(work) / dome_of_elements(probe, at, foundation, 32) - 1)
+    np.testing.assert_array_less(errors, [0.01, 0.002, 0.001])

@@ -44,6 +44,15 @@ class Cells(NamedTuple):
         return np.asarray((self.unclamped < 0).any(axis=-1))
 
 
+class Summary(NamedTuple):
+    """Cells of a surface."""
+
+    sides: tuple[float, float]  # shortest and longest [m]
+    mean: float  # isotropy error, mean over the area
+    worst: float  # isotropy error, largest
+    clamped: int  # number of cells with a spring constant that was set to 0
+
+
 def _get(section: Any, name: str, default: Any = None) -> Any:
     """Return an entry of a mapping, or an attribute of an object; the default where it is missing or None."""
     value = section.get(name) if isinstance(section, Mapping) else getattr(section, name, None)
@@ -176,6 +185,15 @@ def isotropy_error(cells: Cells) -> Array:
         for cell in np.ndindex(p.shape)
     ]
     return np.reshape(errors, p.shape)
+
+
+def summary(rest: Array) -> Summary:
+    """Measure a surface, as check and run.json report it."""
+    measured, errors = cells(rest), isotropy_error(cells(rest))
+    sides = [np.linalg.norm(np.diff(rest, axis=axis), axis=-1) for axis in (0, 1)]
+    mean = float((errors * measured.area).sum() / measured.area.sum())
+    shortest, longest = min(side.min() for side in sides), max(side.max() for side in sides)
+    return Summary((float(shortest), float(longest)), mean, float(errors.max()), int(measured.clamped.sum()))
 
 
 def sum_at_corners(values: Array) -> Array:
