@@ -127,7 +127,7 @@ def _truncated(text: str, kind: str) -> _ContentError:
     return _ContentError(f"{fault}; copy or export the whole file again", len(lines))
 
 
-def _entries(items: Iterable[tuple[Any, Any, int | None]]) -> Entries:
+def build_entries(items: Iterable[tuple[Any, Any, int | None]]) -> Entries:
     """Build the entries of keys, values and lines; a repeated key is an error."""
     values: dict[Any, Any] = {}
     lines: dict[Any, int] = {}
@@ -142,7 +142,7 @@ def _entries(items: Iterable[tuple[Any, Any, int | None]]) -> Entries:
 
 def _json(text: str) -> Any:
     try:
-        return json.loads(text, object_pairs_hook=lambda pairs: _entries((*pair, None) for pair in pairs))
+        return json.loads(text, object_pairs_hook=lambda pairs: build_entries((*pair, None) for pair in pairs))
     except json.JSONDecodeError as error:
         # A truncated text ends within a string or a word.
         if error.msg.startswith("Unterminated") or re.fullmatch(r"[\w.+\\-]*\s*", text[error.pos :]):
@@ -160,7 +160,7 @@ class _Loader(_BaseLoader):  # type: ignore[misc]
 
 
 def _mapping(loader: _Loader, node: yaml.MappingNode) -> Entries:
-    return _entries(
+    return build_entries(
         (
             loader.construct_object(name, deep=True),
             loader.construct_object(value, deep=True),
@@ -224,7 +224,7 @@ def _xml(text: str) -> Entries:
         data = element.find("data")
         words = (element.text or "") if data is None else (data.text or "")
         items.append((element.tag, words.strip() if data is None else {"data": words.split()}, None))
-    return _entries(items)
+    return build_entries(items)
 
 
 def _is_too_long(event: yaml.Event) -> bool:
@@ -245,4 +245,4 @@ def _ini(text: str) -> Entries:
             sections[-1][1].append((entry[0].strip().lower(), entry[1].strip(), n))
         else:
             raise _ContentError(f"{truncate(content)}: neither [SECTION] nor KEY = VALUE; correct the line", n)
-    return _entries((name, _entries(items), n) for name, items, n in sections)
+    return build_entries((name, build_entries(items), n) for name, items, n in sections)

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 from taichi_msm.camera_files.calibration import CalibrationReader
-from taichi_msm.camera_files.camera_file import CameraFile, listed
+from taichi_msm.camera_files.camera_file import CameraFile, Entries, listed
 from taichi_msm.camera_files.key_lookup import Keys
 from taichi_msm.camera_files.opencv import read_camera
 from taichi_msm.camera_files.trajectory import Trajectory, TrajectoryReader, parse_numbers, pose_fault
@@ -52,13 +52,13 @@ def _camera(file: CameraFile, line: int, name: str, width: str, height: str, par
     if name not in MODELS:
         raise file.fault(f"{name}: not a supported model; expected one of: {', '.join(MODELS)}", line)
     focal_count, model, coefficient_count = MODELS[name]
-    count, lines = focal_count + 2 + coefficient_count, {"PARAMS": line}
-    numbers = Keys(file, {"PARAMS": parameters}, lines=lines).require("params", count, name)
+    keys = Keys(file, Entries({"PARAMS": parameters}, {"PARAMS": line}))
+    numbers = keys.require("params", focal_count + 2 + coefficient_count, name)
     fx, fy, (cx, cy) = numbers[0], numbers[focal_count - 1], numbers[focal_count : focal_count + 2]
     values = [*numbers[focal_count + 2 :], *[0.0] * 4][: max(4, coefficient_count)]
     matrix = [fx, 0, cx - 0.5, 0, fy, cy - 0.5, 0, 0, 1]
     data = {"K": matrix, "D": values, "model": model, "size": [width, height]}
-    return Keys(file, data, lines=dict.fromkeys(data, line))
+    return Keys(file, Entries(data, dict.fromkeys(data, line)))
 
 
 def _read_images(file: CameraFile) -> Trajectory | None:

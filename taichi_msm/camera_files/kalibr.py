@@ -55,7 +55,7 @@ def _camera(file: CameraFile, prefix: str, section: Entries) -> Keys:
         raise file.fault(f"{fault}; write {INTRINSICS[model]} numbers", section.lines.get("intrinsics"))
     *xi, fx, fy, cx, cy = numbers
     data = {**section, "intrinsics": [fx, 0, cx, 0, fy, cy, 0, 0, 1], **({"xi": xi} if xi else {})}
-    return Keys(file, data, lines=section.lines)
+    return Keys(file, Entries(data, section.lines))
 
 
 def _sort_key(name: object) -> tuple[int, str]:

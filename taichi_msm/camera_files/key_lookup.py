@@ -21,18 +21,11 @@ ROUNDING_TOLERANCE = 1e-6
 class Keys:
     """Keys of one camera in a calibration."""
 
-    def __init__(
-        self,
-        file: CameraFile,
-        data: Mapping[str, Any],
-        folded: Mapping[str, str] | None = None,
-        lines: Mapping[str, int] | None = None,
-    ) -> None:
+    def __init__(self, file: CameraFile, data: Entries, folded: Mapping[str, str] | None = None) -> None:
         self.file = file
         self.data = data  # values by name in the file
-        # Folded names without the mark of the camera (left, 1, ...), by default with it; line numbers, for messages.
+        # Folded names without the mark of the camera (left, 1, ...), by default with it.
         self.folded = {name: fold(name) for name in data} if folded is None else folded
-        self.lines = (data.lines if isinstance(data, Entries) else {}) if lines is None else lines
         self._read_names: set[str] = set()
 
     def __str__(self) -> str:
@@ -40,7 +33,7 @@ class Keys:
 
     def fault(self, fault: str, name: str | None) -> CameraFileError:
         """Return an error, for the caller to raise, with the line of the key `name`; None for the file as a whole."""
-        return self.file.fault(fault, None if name is None else self.lines.get(name))
+        return self.file.fault(fault, None if name is None else self.data.lines.get(name))
 
     def values(self, spelling: str, kind: type = object) -> dict[str, Any]:
         """Return the non-empty values of a type, by name in the file, whose folded names match a spelling (pattern)."""

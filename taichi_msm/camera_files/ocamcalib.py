@@ -8,7 +8,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from taichi_msm.camera_files.calibration import Calibration, CalibrationReader
-from taichi_msm.camera_files.camera_file import CameraFile
+from taichi_msm.camera_files.camera_file import CameraFile, build_entries
 from taichi_msm.camera_files.key_lookup import Keys
 from taichi_msm.lenses import MODELS
 
@@ -21,10 +21,8 @@ def _cameras(file: CameraFile) -> Sequence[Keys]:
     """Return the keys of the camera, if the file begins with the comment of OCamCalib."""
     if not file.text.lstrip().startswith("#polynomial coefficients"):
         return ()
-    rows = dict(zip(LINES, ((n, line) for n, line in file.lines if line[0] != "#"), strict=False))
-    return [
-        Keys(file, {name: line for name, (_, line) in rows.items()}, lines={name: n for name, (n, _) in rows.items()})
-    ]
+    rows = zip(LINES, ((n, line) for n, line in file.lines if line[0] != "#"), strict=False)
+    return [Keys(file, build_entries((name, line, n) for name, (n, line) in rows))]
 
 
 def _read(keys: Keys) -> Calibration:

@@ -10,7 +10,7 @@ import re
 from collections.abc import Sequence
 
 from taichi_msm.camera_files.calibration import Calibration, CalibrationReader, StereoPose, focal_fault
-from taichi_msm.camera_files.camera_file import listed
+from taichi_msm.camera_files.camera_file import Entries, listed
 from taichi_msm.camera_files.key_lookup import ROUNDING_TOLERANCE, Keys, flat, fold
 from taichi_msm.errors import truncate
 from taichi_msm.lenses import MODELS
@@ -108,7 +108,7 @@ def read_camera(keys: Keys) -> Calibration:
 def read_pose(keys: Keys) -> StereoPose | None:
     """Read R and T; None if the file has neither. R1 and R2 are ignored, as they belong to a rectification."""
     unmarked = {name: value for name, value in keys.data.items() if keys.folded[name] == fold(name)}
-    shared = Keys(keys.file, unmarked, lines=keys.lines)
+    shared = Keys(keys.file, Entries(unmarked, keys.data.lines))
     if not shared.values(ROTATION) and not shared.values(TRANSLATION):
         return None
     rotation = shared.require(ROTATION, 9, "rotation R")

@@ -46,7 +46,7 @@ def _cameras(file: CameraFile) -> Sequence[Keys]:
 def _camera(file: CameraFile, data: Entries, names: dict[str, str]) -> Keys:
     """Return the keys of a camera with folded names, without results of stereoRectify."""
     names = {key: name for key, name in names.items() if RECTIFICATION.get(name) != len(flat(data[key]))}
-    return Keys(file, {key: data[key] for key in names}, names, data.lines)
+    return Keys(file, Entries({key: data[key] for key in names}, data.lines), names)
 
 
 def _pose(keys: Keys) -> StereoPose | None:

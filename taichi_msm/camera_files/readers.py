@@ -91,10 +91,9 @@ def _times(file: CameraFile, trajectory: Trajectory, keys: PoseKeys) -> list[flo
     """Return the time of every pose in the scene [s]."""
     numbers = [row[0] for row in trajectory.rows]
     if not trajectory.has_times:
-        if keys.poses_time is not None:
-            raise file.fault("has no times; set poses_rate, the poses per second, in place of poses_time")
-        if keys.poses_rate is None:
-            raise file.fault("has no times; set poses_rate, the poses per second")
+        if keys.poses_rate is None or keys.poses_time is not None:
+            in_place = "" if keys.poses_time is None else ", in place of poses_time"
+            raise file.fault(f"has no times; set poses_rate, the poses per second{in_place}")
         spacing = math.gcd(*(int(number - numbers[0]) for number in numbers)) or 1
         times = [(number - numbers[0]) / spacing / keys.poses_rate for number in numbers]
     else:

@@ -43,7 +43,7 @@ def _camera(file: CameraFile, section: Entries, line: int | None) -> Keys:
     values["D"] += [section.get(name, "0") for name in MORE_COEFFICIENTS]
     fx, fy, cx, cy = values["intrinsics"]
     lines = {key: section.lines[names[0]] for key, names in KEYS.items() if names[0] in section.lines}
-    return Keys(file, {**values, "intrinsics": [fx, "0", cx, "0", fy, cy, "0", "0", "1"]}, lines=lines)
+    return Keys(file, Entries({**values, "intrinsics": [fx, "0", cx, "0", fy, cy, "0", "0", "1"]}, lines))
 
 
 STEREOMIS = CalibrationReader(

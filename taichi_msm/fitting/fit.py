@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import secrets
 import time
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack
@@ -163,7 +162,7 @@ def _read_problem(
         raise SceneError([f"--drift {drift:g}: take a number of seconds above 0"])
     if settings is None and (messages := list(faults(observations, initial, len(parameters)))):
         raise SceneError(messages)
-    return FitProblem(secrets.token_hex(8), without_outputs(initial), parameters, observations), settings
+    return FitProblem(without_outputs(initial), parameters, observations), settings
 
 
 def _fit(runs: Runs, scene: Scene, method: Method) -> FitResult:
@@ -249,9 +248,7 @@ def _fit(runs: Runs, scene: Scene, method: Method) -> FitResult:
         runs=runs.count,
         notes=notes,
         scene=Scene(**runs.problem.fitted_data(as_data(scene), values)),
-        other_scenes=[
-            Scene(**machine.fitted_data(as_data(scene), values, n)) for n in range(1, len(tests)) if machine is not None
-        ],
+        other_scenes=[Scene(**runs.problem.fitted_data(as_data(scene), values, n)) for n in range(1, len(tests))],
         observations=observations,
         left_out=left_out,
         fitted=solution.predicted.values,

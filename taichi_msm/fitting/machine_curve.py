@@ -28,6 +28,7 @@ from taichi_msm.errors import DivergedError, SceneError, StageProgressCallback
 from taichi_msm.fitting.least_squares import Misfit, Scales, Search, Solution
 from taichi_msm.fitting.machine_model import MachineModel, MachineProblem
 from taichi_msm.fitting.observation import Array
+from taichi_msm.fitting.parameters import with_values
 from taichi_msm.fitting.predict import FitProblem, Prediction, Runs, mesh_error
 from taichi_msm.load.check import check_scene
 from taichi_msm.model.plan import Plan
@@ -98,7 +99,7 @@ class CurveRuns(Runs):
         self._is_lock = np.array([key.endswith(".lock") for key in keys])
 
     def predict_initial(self, x: Array) -> Prediction:
-        self._model.compile(x, self._report_progress)
+        self._model.compile(x)
         return self.run_curve(x)
 
     def predict_one(self, x: Array, steps: int | None = None) -> Prediction | None:
@@ -133,7 +134,7 @@ class CurveRuns(Runs):
     def run_tests(self, x: Array) -> Prediction:
         """Return the prediction by runs of the tests at x; raise the errors of `ForwardModel.predict`."""
         self.count += len(self.problem.tests)
-        return self._model.predict(x, pause=self._report_progress)
+        return self._model.predict(x)
 
     def correct(self, x: Array, predicted: Prediction) -> None:
         """Add the error of the tangent at x to all further predictions; `predicted` is by a curve, or by the tests."""
@@ -236,13 +237,13 @@ class CurveRuns(Runs):
         if key not in self._curves:
             self._report_progress()
             simulation, plan = self._model.start(self._plan_curve(values, reach), None, halvings)
-            self._curves[key] = self._model.forces(simulation, plan, self._report_progress)[:, 0]
+            self._curves[key] = self._model.forces(simulation, plan)[:, 0]
             self.count += 1
         return self._curves[key]
 
     def _plan_curve(self, values: dict[str, float], reach: float) -> Plan:
         """Plan a run with equidistant travels up to `reach` [m], without relaxation."""
-        data = self.problem.with_scene_values(self._model.data, values)
+        data = with_values(self._model.data, values)
         if branches := data.get("tissue", {}).get("relaxation"):
             still_branches = [{**branch, "share": NO_SHARE} for branch in branches]
             data = {**data, "tissue": {**data["tissue"], "relaxation": still_branches}}

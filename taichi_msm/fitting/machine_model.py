@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-import secrets
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, ClassVar
 
@@ -94,27 +93,19 @@ class MachineProblem(FitProblem):
     # Forward differences are sufficient for smooth forces at many frames.
     signs: ClassVar[tuple[int, ...]] = (1,)
 
-    tests: tuple[Loading, ...]
-    approach: Approach
+    approach: Approach = field(kw_only=True)
 
     @property
     def contact_keys(self) -> list[str]:
         """Keys of the depths of contact of all tests."""
         return contact_keys(len(self.tests))
 
-    def build_model(self, threads: int | None) -> ForwardModel:
-        return MachineModel(self, threads)
+    def build_model(self, threads: int | None, pause: Pause = lambda: None) -> ForwardModel:
+        return MachineModel(self, threads, pause)
 
     def fitted_data(self, data: dict[str, Any], values: Mapping[str, float], n: int = 0) -> dict[str, Any]:
-        """Return a scene's data with parameter values, and with path and times of test `n`."""
         test, contact = self.tests[n], values.get(self.contact_keys[n])
-        data = self.with_scene_values(data, values)
-        return self.approach.place(data, test.travel(contact), test.rate)
-
-    def with_scene_values(self, data: dict[str, Any], values: Mapping[str, float]) -> dict[str, Any]:
-        """Return a scene's data with parameter values, except depths of contact, and with unchanged path and times."""
-        of_scene = [parameter for parameter in self.parameters if parameter.key not in self.contact_keys]
-        return with_values(data, of_scene, values)
+        return self.approach.place(with_values(data, values), test.travel(contact), test.rate)
 
     def reach(self, values: Mapping[str, float]) -> float:
         """Return the greatest travel of all tests [m]; `values`: parameter values by key."""
@@ -127,29 +118,22 @@ class MachineModel(ForwardModel):
 
     problem: MachineProblem
 
-    def predict(
-        self,
-        x: Array,
-        steps: int | None = None,
-        *,
-        halvings: int = 0,
-        to_end: bool = False,  # Ignored: every run ends with its test.
-        pause: Pause = lambda: None,
-    ) -> Prediction:
+    def predict(self, x: Array, steps: int | None = None, *, halvings: int = 0, to_end: bool = False) -> Prediction:
+        # Every run ends with its test.
         forces, most_steps = [], 0
         for n in range(len(self.problem.tests)):
             data = self.problem.fitted_data(self.data, self.values(x), n)
             simulation, plan = self.start(check_scene(Scene(**data), self.maps), steps, halvings)
-            forces.append(self.forces(simulation, plan, pause))
+            forces.append(self.forces(simulation, plan))
             most_steps = max(most_steps, plan.grid.steps_per_frame)
         return Prediction((np.concatenate(forces),), most_steps, np.zeros(1))
 
-    def forces(self, simulation: Simulation, plan: Plan, pause: Pause) -> Array:
+    def forces(self, simulation: Simulation, plan: Plan) -> Array:
         """Return the forces of a run along the tool's direction [N], shape (frames, 1), from its first frame."""
         (observed,) = self.problem.observations
         frames = plan.grid.frames + 1
         model = observed.build_model(plan.scene, frames)
-        (recorded,) = self.record([model], simulation, frames, pause)
+        (recorded,) = self.record([model], simulation, frames)
         return model.predict(recorded)
 
 
@@ -220,7 +204,7 @@ def read_machine_problem(
         count = sum(int(np.count_nonzero(loading.information)) for loading in tests)
         fault = f"frames with rows: {count}, too few for {len(parameters)} parameters and the offset of the force"
         raise SceneError([f"{observations.name}: {fault}; raise --rate"])
-    return MachineProblem(secrets.token_hex(8), Scene(**placed), parameters, (observations,), tuple(tests), approach)
+    return MachineProblem(Scene(**placed), parameters, (observations,), tuple(tests), approach=approach)
 
 
 def _make_parameters(

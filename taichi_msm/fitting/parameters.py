@@ -198,15 +198,16 @@ def as_data(scene: Scene) -> dict[str, Any]:
     return scene.model_dump(mode="json", exclude_none=True)
 
 
-def with_values(data: dict[str, Any], parameters: Sequence[Parameter], values: Mapping[str, float]) -> dict[str, Any]:
-    """Return a copy of a scene's data, from `as_data`, with other values of parameters."""
+def with_values(data: dict[str, Any], values: Mapping[str, float]) -> dict[str, Any]:
+    """Return a copy of a scene's data, from `as_data`, with other values by key, except depths of contact."""
     changed = deepcopy(data)
-    for parameter in parameters:
-        container: Any = changed
-        for part in parameter.path[:-1]:
-            container = container[part if isinstance(container, list) else str(part)]
-        last = parameter.path[-1]
-        container[last if isinstance(container, list) else str(last)] = values[parameter.key]
+    for key, value in values.items():
+        *parts, last = parse_key(key)
+        if key.partition(".")[0] != "contact":
+            container: Any = changed
+            for part in parts:
+                container = container[part if isinstance(container, list) else str(part)]
+            container[last if isinstance(container, list) else str(last)] = value
     return changed
 
 

@@ -6,10 +6,11 @@ Runs are in f64, and every process compiles its kernels once.
 from __future__ import annotations
 
 import math
+import secrets
 import time
 from collections.abc import Mapping, Sequence
 from concurrent.futures import Future, wait
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
@@ -21,6 +22,7 @@ from taichi_msm.fitting.observation import Array, Observation, ObservationModel,
 from taichi_msm.fitting.parameters import Parameter, as_data, with_values
 from taichi_msm.load import cost
 from taichi_msm.load.check import check_scene
+from taichi_msm.machines.loading import Loading
 from taichi_msm.model.plan import Plan
 from taichi_msm.runs.simulation import Simulation
 from taichi_msm.scene.scene import Scene
@@ -46,10 +48,11 @@ class FitProblem:
     # Sides of the finite differences at the solution: (1, -1) central, (1,) forward.
     signs: ClassVar[tuple[int, ...]] = (1, -1)
 
-    token: str  # identifier of the fit in worker processes
     scene: Scene  # with its initial values
     parameters: tuple[Parameter, ...]
     observations: tuple[Observation, ...]
+    tests: tuple[Loading, ...] = ()  # of testing machines
+    token: str = field(default_factory=lambda: secrets.token_hex(8))  # identifier of the fit in worker processes
 
     @property
     def limits(self) -> tuple[Array, Array]:
@@ -62,13 +65,13 @@ class FitProblem:
         """Step of finite differences, in units of x, large enough for all observations."""
         return max(observed.difference_step(self.scene) for observed in self.observations)
 
-    def build_model(self, threads: int | None) -> ForwardModel:
+    def build_model(self, threads: int | None, pause: Pause = lambda: None) -> ForwardModel:
         """Build the forward model on a number of threads, by default on all cores."""
-        return ForwardModel(self, threads)
+        return ForwardModel(self, threads, pause)
 
-    def fitted_data(self, data: dict[str, Any], values: Mapping[str, float]) -> dict[str, Any]:
-        """Return a scene's data, from `as_data`, with parameter values by key."""
-        return with_values(data, self.parameters, values)
+    def fitted_data(self, data: dict[str, Any], values: Mapping[str, float], n: int = 0) -> dict[str, Any]:  # noqa: ARG002
+        """Return a scene's data, from `as_data`, with parameter values by key; `n`: index of a machine test."""
+        return with_values(data, values)
 
 
 def without_outputs(scene: Scene) -> Scene:
@@ -80,23 +83,14 @@ def without_outputs(scene: Scene) -> Scene:
 class ForwardModel:
     """Forward model of a fit: a simulation that is restarted for every prediction."""
 
-    def __init__(self, problem: FitProblem, threads: int | None) -> None:
+    def __init__(self, problem: FitProblem, threads: int | None, pause: Pause = lambda: None) -> None:
         self.problem, self.data = problem, as_data(problem.scene)
-        plan = check_scene(problem.scene)
-        self.maps, self._threads = plan.maps, threads
+        self.maps, self._threads, self._pause = check_scene(problem.scene).maps, threads, pause
         self._simulation: Simulation | None = None
         times = np.concatenate([observed.time for observed in problem.observations])
         self._frames = max(2, math.ceil(time_in_frames(problem.scene, times).max()) + 1)
 
-    def predict(
-        self,
-        x: Array,
-        steps: int | None = None,
-        *,
-        halvings: int = 0,
-        to_end: bool = False,
-        pause: Pause = lambda: None,
-    ) -> Prediction:
+    def predict(self, x: Array, steps: int | None = None, *, halvings: int = 0, to_end: bool = False) -> Prediction:
         """Return the prediction of a run with the parameters at x, shape (n,).
 
         `steps` is the smallest number per frame, by default enough for finite differences around x; `halvings` is that
@@ -107,7 +101,7 @@ class ForwardModel:
         # The mesh of a coarse run differs.
         models = [observed.build_model(plan.scene, self._frames) for observed in self.problem.observations]
         frames = max(self._frames, plan.grid.frames + 1) if to_end else self._frames
-        pairs = list(zip(models, self.record(models, simulation, frames, pause), strict=True))
+        pairs = list(zip(models, self.record(models, simulation, frames), strict=True))
         values = tuple(model.predict(recorded[: self._frames]) for model, recorded in pairs)
         motion = np.fmax.reduce([model.motion(recorded) for model, recorded in pairs])
         return Prediction(values, plan.grid.steps_per_frame, motion)
@@ -130,10 +124,10 @@ class ForwardModel:
             self._simulation.restart(plan)
         return self._simulation, plan
 
-    def compile(self, x: Array, pause: Pause) -> None:
+    def compile(self, x: Array) -> None:
         """Compile the kernels; raise a SceneError if the scene at x is invalid."""
         self._simulation = Simulation(self.plan(x), threads=self._threads)
-        self._simulation.compile(pause)
+        self._simulation.compile(self._pause)
 
     def try_predict(self, x: Array, steps: int | None = None, **options: Any) -> Prediction | None:
         """Return the prediction at x, or None if the run fails or an observed point is behind the camera."""
@@ -156,13 +150,11 @@ class ForwardModel:
         """Plan the scene with the parameters at x; raise a SceneError if it is not valid."""
         return check_scene(Scene(**self.problem.fitted_data(self.data, self.values(x))), self.maps)
 
-    def record(
-        self, models: Sequence[ObservationModel], simulation: Simulation, frames: int, pause: Pause
-    ) -> list[Array]:
+    def record(self, models: Sequence[ObservationModel], simulation: Simulation, frames: int) -> list[Array]:
         """Return the records of a run from its first frame: for each model those of all frames, stacked."""
         records: list[list[Array]] = [[] for _ in models]
         for frame in range(frames):
-            simulation.advance(min(frame, 1), pause)
+            simulation.advance(min(frame, 1), self._pause)
             for model, of_model in zip(models, records, strict=True):
                 of_model.append(model.record(simulation))
         return [np.array(of_model) for of_model in records]
@@ -211,22 +203,22 @@ class Runs:
         self.problem = problem
         self.count = self.expected = 0  # number of finished runs, and the expected number
         self._workers, self._progress = workers, progress
-        self._model = problem.build_model(threads=None)
+        self._model = problem.build_model(None, self._report_progress)
         self._pool: Pool | None = None
         self._seconds = 0.0
 
     def predict_initial(self, x: Array) -> Prediction:
         """Compile, and return the prediction at x to the last frame; raise the errors of `ForwardModel.predict`."""
-        self._model.compile(x, self._report_progress)
+        self._model.compile(x)
         start = time.perf_counter()
-        predicted = self._model.predict(x, to_end=True, pause=self._report_progress)
+        predicted = self._model.predict(x, to_end=True)
         self._seconds, self.count = time.perf_counter() - start, self.count + 1
         return predicted
 
     def predict_coarse(self, x: Array, halvings: int) -> Prediction | None:
         """Return the prediction of a coarser mesh, or None if it fails."""
         self.count += 1
-        return self._model.try_predict(x, halvings=halvings, pause=self._report_progress)
+        return self._model.try_predict(x, halvings=halvings)
 
     def mesh_error(self, x: Array) -> float | None:
         """Return the estimated mesh error at x, as the function `mesh_error` does."""
@@ -235,9 +227,8 @@ class Runs:
     def predict_one(self, x: Array, steps: int | None = None) -> Prediction | None:
         """Return the prediction at x, or None if it fails."""
         self._report_progress()
-        predicted = self._model.try_predict(x, steps, pause=self._report_progress)
         self.count += 1
-        return predicted
+        return self._model.try_predict(x, steps)
 
     def predict_many(self, coordinates: Sequence[Array], steps: int | None = None) -> list[Prediction | None]:
         """Return predictions in parallel if that pays off, each None if it fails. A dead process is an error."""

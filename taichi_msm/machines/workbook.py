@@ -11,9 +11,10 @@ import io
 import posixpath
 import re
 import zipfile
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import suppress
 from functools import lru_cache
+from itertools import chain
 from xml.parsers import expat
 
 from taichi_msm.errors import SceneError
@@ -73,15 +74,12 @@ class _Workbook:
         """Read all worksheets of the file of a name."""
         (book,) = [target for kind, target in self._relations("").values() if kind == "officeDocument"]
         relations, sheets = self._relations(book), {}
-
-        def start(tag: str, attributes: Attributes) -> None:
+        for tag, attributes, _ in self._elements(book):
             if tag == "sheet":
                 (key,) = [value for key, value in attributes.items() if key.endswith(":id")]
                 if relations[key][0] == "worksheet":
                     sheets[attributes["name"]] = relations[key][1]
                     _require("sheets", len(sheets), MAX_SHEETS)
-
-        self._parse(book, start)
         parts = dict(relations.values())
         texts = self._read_texts(parts["sharedStrings"]) if "sharedStrings" in parts else []
         dates = self._date_styles(parts["styles"]) if "styles" in parts else set()
@@ -91,39 +89,33 @@ class _Workbook:
         """Return the kind and the path of every part that a part refers to, by key."""
         folder, file = posixpath.split(part)
         relations = {}
-
-        def start(tag: str, attributes: Attributes) -> None:
+        for tag, attributes, _ in self._elements(posixpath.join(folder, "_rels", f"{file}.rels")):
             if tag == "Relationship":
                 target = posixpath.normpath(posixpath.join("/", folder, attributes["Target"]))[1:]
                 relations[attributes["Id"]] = attributes["Type"].rpartition("/")[2], target
                 _require("parts", len(relations), 2 * MAX_SHEETS)
-
-        self._parse(posixpath.join(folder, "_rels", f"{file}.rels"), start)
         return relations
 
     def _read_texts(self, part: str) -> list[str]:
         """Return the texts that cells share, by index."""
         texts, text = [], ""
-
-        def end(tag: str, content: str) -> None:
-            nonlocal text
+        for tag, _, content in self._elements(part):
             if tag == "t":
                 text += content
                 _require("characters in a cell", len(text), MAX_CELL_CHARACTERS)
             elif tag == "si":
                 texts.append(" ".join(text.split()))
                 text = ""
-
-        self._parse(part, end=end)
         return texts
 
     def _date_styles(self, part: str) -> set[str]:
         """Return the indices of the styles that show numbers as dates or times of day."""
         formats, styles = {str(number) for number in DATE_FORMATS}, list[bool]()
-
-        def start(tag: str, attributes: Attributes) -> None:
-            if tag == "cellXfs":
+        for tag, attributes, _ in self._elements(part):
+            if tag == "cellStyleXfs":
                 styles.clear()
+            elif tag == "cellXfs":
+                break
             elif tag == "numFmt":
                 # The first section is for positive numbers; Excel accepts 255 characters.
                 first = LITERAL.sub("", attributes["formatCode"][:255].partition(";")[0])
@@ -132,42 +124,38 @@ class _Workbook:
             elif tag == "xf":
                 styles.append(attributes.get("numFmtId") in formats)
             _require("styles", len(styles) + len(formats), MAX_STYLES)
-
-        self._parse(part, start)
         return {str(style) for style, is_date in enumerate(styles) if is_date}
 
     def _read_sheet(self, grid: Grid, part: str, texts: list[str], dates: set[str]) -> Grid:
         """Read the cells of a worksheet as strings into an empty grid."""
-        row, column, cell, value, formula = -1, -1, Attributes(), "", ""
-
-        def start(tag: str, attributes: Attributes) -> None:
-            nonlocal row, column, cell, value, formula
-            if tag == "c":
-                cell, value, formula = attributes, "", ""
-                column = _column_index(cell["r"].rstrip("0123456789")) if "r" in cell else column + 1
-            elif tag == "row":
-                row, column = _index(attributes["r"]) - 1 if "r" in attributes else row + 1, -1
-            elif tag == "mergeCell" and (corners := RANGE.fullmatch(attributes["ref"])):
-                first, last = _column_index(corners[1]), _column_index(corners[3])
-                if first < last:
-                    _require("merged ranges", len(grid.merged), MAX_MERGED)
-                    grid.merged.append((int(corners[2]) - 1, int(corners[4]) - 1, first))
-
-        def end(tag: str, content: str) -> None:
-            nonlocal value, formula
+        row, column, cells, value, formula = -1, -1, list[tuple[int, str]](), "", ""
+        for tag, attributes, content in self._elements(part):
             if tag == "v" or tag == "t":
                 value += content
                 _require("characters in a cell", len(value), MAX_CELL_CHARACTERS)
             elif tag == "f":
                 formula = f"={content}"
-            elif tag == "c" and (value or formula):
-                kind = cell.get("t", "n")
+            elif tag == "c":
+                has_column, kind = "r" in attributes, attributes.get("t", "n")
+                column = _column_index(attributes["r"].rstrip("0123456789")) if has_column else column + 1
                 if value:
-                    value = texts[_index(value)] if kind == "s" else _format(value, kind, cell.get("s") in dates)
+                    is_date = attributes.get("s") in dates
+                    value = texts[_index(value)] if kind == "s" else _format(value, kind, is_date)
                 if shown := " ".join((value or formula).split()):
+                    cells.append((column, shown))
+                if len(cells) > MAX_COLUMNS:
+                    raise ValueError
+                value = formula = ""
+            elif tag == "row":
+                row = _index(attributes["r"]) - 1 if "r" in attributes else row + 1
+                for column, shown in cells:
                     self._put(grid.rows, row, column, shown)
-
-        self._parse(part, start, end)
+                column, cells = -1, []
+            elif tag == "mergeCell" and (corners := RANGE.fullmatch(attributes["ref"])):
+                first, last = _column_index(corners[1]), _column_index(corners[3])
+                if first < last:
+                    _require("merged ranges", len(grid.merged), MAX_MERGED)
+                    grid.merged.append((int(corners[2]) - 1, int(corners[4]) - 1, first))
         return grid
 
     def _put(self, rows: list[Row], row: int, column: int, text: str) -> None:
@@ -184,13 +172,8 @@ class _Workbook:
         rows[row].extend([""] * new_cells)
         rows[row][column] = text
 
-    def _parse(
-        self,
-        part: str,
-        start: Callable[[str, Attributes], None] = lambda tag, attributes: None,
-        end: Callable[[str, str], None] = lambda tag, content: None,
-    ) -> None:
-        """Call functions of the tag and the attributes of each element, and of its tag and the text before its end."""
+    def _elements(self, part: str) -> Iterator[tuple[str, Attributes, str]]:
+        """Yield tag, attributes and last text of every element at its end, except those of pronunciations."""
         # Before anything is kept.
         for chunk in self._chunks(part):
             self._bytes += len(chunk)
@@ -198,26 +181,24 @@ class _Workbook:
             self._marks += chunk.count(b"<") + chunk.count(b"=")
             _require("tags and attributes", self._marks, MAX_MARKS)
         names: dict[str, str] = {}
-        tags = _LocalNames()
-        depth = skipped = size = 0
+        opened, ended = list[Attributes](), list[tuple[str, Attributes, str]]()
+        skipped = size = 0
         text = ""
 
         def start_element(name: str, attributes: Attributes) -> None:
-            nonlocal depth, skipped, text
-            depth, text = depth + 1, ""
-            tag = tags[name]
-            if skipped or tag == "rPh":  # pronunciation
-                skipped += 1
-            else:
-                start(tag, attributes)
+            nonlocal skipped, text
+            opened.append(attributes)
+            text = ""
+            skipped += bool(skipped or name.endswith("rPh"))
 
         def end_element(name: str) -> None:
-            nonlocal depth, skipped, text
+            nonlocal skipped, text
+            attributes = opened.pop()
             if skipped:
                 skipped -= 1
             else:
-                end(tags[name], text)
-            depth, text = depth - 1, ""
+                ended.append((name.rpartition(":")[2], attributes, text))
+            text = ""
 
         def characters(content: str) -> None:
             nonlocal text
@@ -231,14 +212,15 @@ class _Workbook:
         parser.buffer_text = True
         parser.StartElementHandler, parser.EndElementHandler = start_element, end_element
         parser.CharacterDataHandler, parser.StartDoctypeDeclHandler = characters, refuse_entities
-        for chunk in self._chunks(part):
+        for chunk in chain(self._chunks(part), [b""]):
             size += len(chunk)
-            parser.Parse(chunk, False)
+            parser.Parse(chunk, not chunk)
             # Expat parses an unfinished tag again with every chunk, and keeps all names and open elements.
             _require("bytes in a tag", size - parser.CurrentByteIndex, MAX_TAG_BYTES)
             _require("names of XML", len(names), MAX_NAMES)
-            _require("nested elements", depth, MAX_DEPTH)
-        parser.Parse(b"", True)
+            _require("nested elements", len(opened), MAX_DEPTH)
+            yield from ended
+            ended.clear()
 
     def _chunks(self, part: str) -> Iterator[bytes]:
         """Yield a part, unpacked."""
@@ -247,14 +229,6 @@ class _Workbook:
             raise ValueError  # of others zipfile unpacks any number of bytes at once
         with self._archive.open(entry) as file:
             yield from iter(lambda: file.read(CHUNK_BYTES), b"")
-
-
-class _LocalNames(dict[str, str]):
-    """Names of elements without their prefixes."""
-
-    def __missing__(self, name: str) -> str:
-        self[name] = name.rpartition(":")[2]
-        return self[name]
 
 
 def _require(what: str, amount: int, limit: int) -> None:

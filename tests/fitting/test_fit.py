@@ -387,7 +387,7 @@ def test_failed_runs_of_a_search(tracks: Arrays, monkeypatch: pytest.MonkeyPatch
 
 def test_runs_that_a_search_leaves_out(tracks: Arrays, message: Messages) -> None:
     """With infinite values, and with more halvings of the cells than the sheet has."""
-    problem = FitProblem("", without_outputs(changed()), make_parameters(changed(), [YOUNG], {}),
+    problem = FitProblem(without_outputs(changed()), make_parameters(changed(), [YOUNG], {}),
                          (read_observations(tracks, 25),))  # fmt: skip
     model = ForwardModel(problem, 1)
     with message.raises(SceneError):

@@ -208,7 +208,7 @@ def linear_problem(outliers: int = 0) -> tuple[Misfit, LinearRuns]:
     slopes = np.stack([joined[0], joined[0] ** 2 / 10], axis=1)
     keys = ("tissue.young", "tissue.stiffening.lock")
     parameters = tuple(Parameter(key, 1.0, -9.0, 9.0, 1.0) for key in keys)
-    problem = MachineProblem("", RELAXING, parameters, (observed,), tuple(tests), approach)
+    problem = MachineProblem(RELAXING, parameters, (observed,), tuple(tests), approach=approach)
     return Misfit([observed], [1.0], robust=outliers > 0), LinearRuns(problem, slopes)
 
 
