@@ -466,8 +466,8 @@ def _fit(scene: Scene) -> Camera:
     """Return the preset fit: the sheet at rest fills the picture, except for a margin of 2 %.
 
     On a flat sheet, in the camera's axes up and forward, from the sheet's centre, the upper edge is at (a, b) and the
-    lower edge at (-a, -b). From an eye at (-a b / d, -d) they have the tangents a / d and -a / d, so the sheet is centred. The lower
-    edge is the nearer one: half its width has the tangent width / 2 / (d - b).
+    lower edge at (-a, -b). From an eye at (-a b / d, -d) they have the tangents a / d and -a / d, so the sheet is
+    centred. The lower edge is the nearer one: half its width has the tangent width / 2 / (d - b).
     """
     if scene.sheet.surface:
         return _fit_points(scene)
