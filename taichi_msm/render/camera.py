@@ -22,9 +22,7 @@ from taichi_msm.scene.section import FRAME_TOLERANCE, MAX_SUPERSAMPLE, MIN_MAGNI
 
 Array = NDArray[np.float64]
 
-# Presets oblique and fit: direction from the target to the eye, over the lower edge of the sheet and 50 degrees above
-# it; field of view [degrees].
-OBLIQUE_DIRECTION = np.array([0.0, -0.64, 0.77])
+# Field of view of the presets oblique and fit [degrees].
 OBLIQUE_FOV = 32.0
 
 # Maximum baseline of a stereo pair, in units of the sheet's larger side.
@@ -449,8 +447,7 @@ def _fit(scene: Scene) -> Camera:
     (-a, -b). From an eye at (-a b / d, -d) they have the tangents a / d and -a / d, so the sheet is centred. The lower
     edge is the nearer one: half its width has the tangent width / 2 / (d - b).
     """
-    (height, width), (width_px, height_px) = scene.sheet.size, scene.render.size
-    axes = _look_at_axes(OBLIQUE_DIRECTION.tolist(), (0, 0, 0), (0, 1, 0))
+    (height, width), (width_px, height_px), axes = scene.sheet.size, scene.render.size, OBLIQUE_AXES
     a, b = height / 2 * axes[1, 1], -height / 2 * axes[2, 1]
     half_height = (1 - 2 * 0.02) * math.tan(math.radians(OBLIQUE_FOV) / 2)
     distance = max(a / half_height, width / 2 / (half_height * width_px / height_px) + b)
@@ -462,13 +459,12 @@ def _fit(scene: Scene) -> Camera:
 def _oblique(scene: Scene) -> Camera:
     """Return the preset oblique: the sheet at rest fits into the picture, with a margin of 4 % in distance."""
     (height, width), (width_px, height_px) = scene.sheet.size, scene.render.size
-    toward = OBLIQUE_DIRECTION / np.linalg.norm(OBLIQUE_DIRECTION)
-    axes = _look_at_axes(toward.tolist(), (0, 0, 0), (0, 1, 0))
-    corners = np.array([[x, y, 0.0] for x in (-width / 2, width / 2) for y in (-height / 2, height / 2)]) @ axes.T
+    corners = np.array([[x, y, 0.0] for x in (-width / 2, width / 2) for y in (-height / 2, height / 2)])
+    corners = corners @ OBLIQUE_AXES.T
     half_height = np.tan(np.radians(OBLIQUE_FOV) / 2)
     half = np.array([half_height * width_px / height_px, half_height])
     distance = float((corners[:, 2:] + np.abs(corners[:, :2]) / half).max()) * 1.04
-    return Camera(eye=tuple(distance * toward), fov=OBLIQUE_FOV)
+    return Camera(eye=tuple(distance * OBLIQUE_AXES[2]), fov=OBLIQUE_FOV)
 
 
 PRESET_CAMERAS = {"oblique": _oblique, "fit": _fit}
@@ -542,3 +538,7 @@ def _interpolate_poses(poses: Sequence[Sequence[float]], time: float) -> tuple[A
     fraction = (clamped_time - rows[0, 0]) / (rows[1, 0] - rows[0, 0])
     rotation = Slerp(rows[:, 0], Rotation.from_quat(rows[:, 4:]))(clamped_time).as_matrix()
     return rows[0, 1:4] * (1 - fraction) + rows[1, 1:4] * fraction, rotation
+
+
+# Axes of the presets oblique and fit: over the lower edge of the sheet, and 50 degrees above it.
+OBLIQUE_AXES = _look_at_axes((0.0, -0.64, 0.77), (0, 0, 0), (0, 1, 0))

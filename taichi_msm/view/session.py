@@ -122,6 +122,11 @@ class Session(AbstractContextManager["Session"]):
         self._drag_start: tuple[SheetPosition, NDArray[np.floating] | None] | None = None
         self._draw()
 
+    def _reset_status(self) -> None:
+        self._single_step = self._has_warned_of_length = self._material_changed = False
+        self._max_felt_force = 0.0  # since the last reset [N]
+        self.divergence_error = ""  # message of the divergence that stopped the simulation
+
     @property
     def frame(self) -> int:
         """Number of frames simulated since the last reset."""
@@ -434,11 +439,6 @@ class Session(AbstractContextManager["Session"]):
         self.scene = with_value(self.scene, key, value)
         if self._position_tool is not None:
             self._position_tool.grid = plan.grid
-
-    def _reset_status(self) -> None:
-        self._single_step = self._has_warned_of_length = self._material_changed = False
-        self._max_felt_force = 0.0  # since the last reset [N]
-        self.divergence_error = ""  # message of the divergence that stopped the simulation
 
     def _end_film(self) -> None:
         film, self._film = self._film, None
