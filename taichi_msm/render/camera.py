@@ -23,9 +23,7 @@ from taichi_msm.scene.section import FRAME_TOLERANCE, MAX_SUPERSAMPLE, MIN_MAGNI
 
 Array = NDArray[np.float64]
 
-# Presets oblique and fit: direction from the target to the eye, over the lower edge of the sheet and 50 degrees above
-# it; field of view [degrees].
-OBLIQUE_DIRECTION = np.array([0.0, -0.64, 0.77])
+# Field of view of the presets oblique and fit [degrees].
 OBLIQUE_FOV = 32.0
 
 # Maximum baseline of a stereo pair, in units of the sheet's larger side.
@@ -471,8 +469,7 @@ def _fit(scene: Scene) -> Camera:
     """
     if scene.sheet.surface:
         return _fit_points(scene)
-    (height, width), (width_px, height_px) = scene.sheet.size, scene.render.size
-    axes = _look_at_axes(OBLIQUE_DIRECTION.tolist(), (0, 0, 0), (0, 1, 0))
+    (height, width), (width_px, height_px), axes = scene.sheet.size, scene.render.size, OBLIQUE_AXES
     a, b = height / 2 * axes[1, 1], -height / 2 * axes[2, 1]
     half_height = (1 - 2 * 0.02) * math.tan(math.radians(OBLIQUE_FOV) / 2)
     distance = max(a / half_height, width / 2 / (half_height * width_px / height_px) + b)
@@ -488,8 +485,7 @@ def _fit_points(scene: Scene) -> Camera:
     each side the largest t Z + X bounds t z + x, and likewise the lower bound. The nearest eye meets both bounds of the
     tighter direction, and is centred in the other one.
     """
-    rest, (width_px, height_px) = rest_of(scene.sheet), scene.render.size
-    axes = _look_at_axes(OBLIQUE_DIRECTION.tolist(), (0, 0, 0), (0, 1, 0))
+    rest, (width_px, height_px), axes = rest_of(scene.sheet), scene.render.size, OBLIQUE_AXES
     points = rest.position.reshape(-1, 3) @ axes.T
     half_height = (1 - 2 * 0.02) * math.tan(math.radians(OBLIQUE_FOV) / 2)
     tangents = half_height * np.array([width_px / height_px, 1.0])
@@ -504,13 +500,12 @@ def _fit_points(scene: Scene) -> Camera:
 def _oblique(scene: Scene) -> Camera:
     """Return the preset oblique: the sheet at rest fits into the picture, with a margin of 4 % in distance."""
     rest, (width_px, height_px) = rest_of(scene.sheet), scene.render.size
-    toward = OBLIQUE_DIRECTION / np.linalg.norm(OBLIQUE_DIRECTION)
-    axes, middle = _look_at_axes(toward.tolist(), (0, 0, 0), (0, 1, 0)), rest.box.mean(axis=0)
-    corners = (rest.outline - middle) @ axes.T
+    middle = rest.box.mean(axis=0)
+    corners = (rest.outline - middle) @ OBLIQUE_AXES.T
     half_height = np.tan(np.radians(OBLIQUE_FOV) / 2)
     half = np.array([half_height * width_px / height_px, half_height])
     distance = float((corners[:, 2:] + np.abs(corners[:, :2]) / half).max()) * 1.04
-    return Camera(eye=tuple(middle + distance * toward), target=tuple(middle), fov=OBLIQUE_FOV)
+    return Camera(eye=tuple(middle + distance * OBLIQUE_AXES[2]), target=tuple(middle), fov=OBLIQUE_FOV)
 
 
 PRESET_CAMERAS = {"oblique": _oblique, "fit": _fit}
@@ -584,3 +579,7 @@ def _interpolate_poses(poses: Sequence[Sequence[float]], time: float) -> tuple[A
     fraction = (clamped_time - rows[0, 0]) / (rows[1, 0] - rows[0, 0])
     rotation = Slerp(rows[:, 0], Rotation.from_quat(rows[:, 4:]))(clamped_time).as_matrix()
     return rows[0, 1:4] * (1 - fraction) + rows[1, 1:4] * fraction, rotation
+
+
+# Axes of the presets oblique and fit: over the lower edge of the sheet, and 50 degrees above it.
+OBLIQUE_AXES = _look_at_axes((0.0, -0.64, 0.77), (0, 0, 0), (0, 1, 0))

@@ -226,26 +226,26 @@ def cross(a: ti.template(), b: ti.template()):
 def clip(low_x, high_x, low_y, high_y, band: ti.template()):
     """Clip a rectangle [samples] to a band.
 
-    Return the first column, the column after the last one, the first row, and the row after the last one of its
-    samples.
+    Return a list of the first column, the column after the last one, the first row, and the row after the last one of
+    its samples.
     """
-    return (
+    return [
         ti.cast(ti.math.clamp(ti.floor(low_x), band.left, band.right), ti.i32),
         ti.cast(ti.math.clamp(ti.ceil(high_x), band.left, band.right), ti.i32),
         ti.cast(ti.math.clamp(ti.floor(low_y), band.top, band.bottom), ti.i32),
         ti.cast(ti.math.clamp(ti.ceil(high_y), band.top, band.bottom), ti.i32),
-    )
+    ]
 
 
 @ti.func
-def tile_range(first_column, end_column, first_row, end_row, band: ti.template()):
+def tile_range(clipped: ti.template(), band: ti.template()):
     """Return the tiles that a rectangle of samples overlaps, as `clip`; their rows count from the band's top."""
     tile_width, tile_height = ti.static((band.config.tile_width, band.config.tile_height))
     return (
-        first_column // tile_width,
-        (end_column + (tile_width - 1)) // tile_width,
-        (first_row - band.top) // tile_height,
-        (end_row - band.top + (tile_height - 1)) // tile_height,
+        clipped[0] // tile_width,
+        (clipped[1] + (tile_width - 1)) // tile_width,
+        (clipped[2] - band.top) // tile_height,
+        (clipped[3] - band.top + (tile_height - 1)) // tile_height,
     )
 
 

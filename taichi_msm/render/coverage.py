@@ -132,10 +132,8 @@ def cover_cell(i, j, invertible, first, end, outline: ti.template(), band: ti.te
             low_x, high_x, low_y, high_y = geometry.distorted_cell_bounds(
                 distorted_entry, band.cols, outline, band.uniforms, band.nodes
             )
-        first_column, end_column, first_row, end_row = clip(low_x - 0.5, high_x + 0.5, low_y - 0.5, high_y + 0.5, band)
-        first_tile, end_tile, first_tile_row, end_tile_row = tile_range(
-            first_column, end_column, first_row, end_row, band
-        )
+        clipped = clip(low_x - 0.5, high_x + 0.5, low_y - 0.5, high_y + 0.5, band)
+        first_tile, end_tile, first_tile_row, end_tile_row = tile_range(clipped, band)
         tiles = ti.max(end_tile_row - first_tile_row, 0) * ti.max(end_tile - first_tile, 0)
         tile, tile_row = first_tile, first_tile_row
         # Software pipelining: find the sub-quads of a tile, then cover the previous tile. The two are independent, so
@@ -167,10 +165,10 @@ def cover_cell(i, j, invertible, first, end, outline: ti.template(), band: ti.te
                     # Samples beyond the bounds are left out: rounding could cover them, depending on the tile shape.
                     sample_x, sample_y = sample_centres(tile_x, tile_y, config)
                     inside = (
-                        (sample_x > ti.cast(first_column, ti.f32))
-                        & (sample_x < ti.cast(end_column, ti.f32))
-                        & (sample_y > ti.cast(first_row, ti.f32))
-                        & (sample_y < ti.cast(end_row, ti.f32))
+                        (sample_x > ti.cast(clipped[0], ti.f32))
+                        & (sample_x < ti.cast(clipped[1], ti.f32))
+                        & (sample_y > ti.cast(clipped[2], ti.f32))
+                        & (sample_y < ti.cast(clipped[3], ti.f32))
                     )
                     if ti.static(config.has_distortion):
                         inside = inside & (x < INVALID_COORDINATE)
@@ -261,10 +259,8 @@ def cover_instruments(band: ti.template()):
             # Tiles are selected below, by their undistorted boxes.
             low_x, high_x, low_y, high_y = band.left, band.right, band.top, band.bottom
         if low_y < band.bottom and high_y > band.top:
-            first_column, end_column, first_row, end_row = clip(low_x, high_x, low_y, high_y, band)
-            first_tile, end_tile, first_tile_row, end_tile_row = tile_range(
-                first_column, end_column, first_row, end_row, band
-            )
+            clipped = clip(low_x, high_x, low_y, high_y, band)
+            first_tile, end_tile, first_tile_row, end_tile_row = tile_range(clipped, band)
             for tile_row in range(first_tile_row, end_tile_row):
                 for tile in range(first_tile, end_tile):
                     entry = band.first + (tile_row * band.tiles_across + tile) * config.planes

@@ -140,18 +140,24 @@ class SteppingStudy:
         """Simulate the scene, append the time of stepping [s] to the samples, and return the frames."""
         dynamics = self._dynamics[precision]
         plan = self._plans[difference].with_grid(precision=precision, steps_per_frame=steps)
-        dynamics.restart(plan)
         frames = np.empty((plan.grid.frames, *plan.scene.sheet.points, 3), precision.replace("f", "float"))
-        seconds = 0.0
-        for frame in frames:
+        seconds = []
+        for frame, duration in zip(frames, _simulate(dynamics, plan), strict=True):
             self._progress(self._done, self._total)
-            start = time.perf_counter()
-            dynamics.advance(steps)
-            seconds += time.perf_counter() - start
+            seconds.append(duration)
             frame[:] = dynamics.displacement()
-        samples.append(seconds)
+        samples.append(sum(seconds))
         self._done += 1
         return frames
+
+
+def _simulate(dynamics: Dynamics, plan: Plan) -> Iterator[float]:
+    """Simulate the scene of a plan; yield the time of the steps of every frame [s]."""
+    dynamics.restart(plan)
+    for _ in range(plan.grid.frames):
+        start = time.perf_counter()
+        dynamics.advance(plan.grid.steps_per_frame)
+        yield time.perf_counter() - start
 
 
 def _relative_error(error: Array, largest: float) -> float:
@@ -272,14 +278,10 @@ class MeshStudy:
 
     def _step_through(self, sheet: _MeshRun) -> float:
         """Simulate the scene with the automatic step; return the time of the steps [s]."""
-        plan, dynamics, _ = sheet
-        dynamics.restart(plan)
         seconds = 0.0
-        for _ in range(plan.grid.frames):
+        for duration in _simulate(sheet.dynamics, sheet.plan):
             self._tick()
-            start = time.perf_counter()
-            dynamics.advance(plan.grid.steps_per_frame)
-            seconds += time.perf_counter() - start
+            seconds += duration
         self._done += 1
         return seconds
 

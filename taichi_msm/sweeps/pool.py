@@ -57,6 +57,9 @@ class Pool(Executor):
         for process in list(self._processes.values()):
             _close(process)
 
+    def __exit__(self, error: type[BaseException] | None, *_: object) -> None:
+        self.shutdown(cancel_futures=error is not None)
+
     def _call(self, *call: Any) -> Any:
         thread = get_ident()
         with self._lock:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import Executor
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, nullcontext
 from pathlib import Path
 from typing import Any
 
@@ -105,33 +105,24 @@ def sweep(
     return execute()
 
 
-@contextmanager
 def open_executor(
     executor: Executor | str | None, workers: int, state: SweepState, progress: StageProgressCallback
-) -> Iterator[Executor]:
-    """Open the executor of a sweep: an executor, the address of a dask scheduler, or None for a new `Pool`.
+) -> AbstractContextManager[Executor]:
+    """Return the context of a sweep's executor: an executor, the address of a dask scheduler, or None for a new `Pool`.
 
-    Its own processes end with the block. Raise a NotInstalledError without dask.distributed, and the errors of
-    `cluster.cluster_connection`.
+    Only the processes of a pool end with the context. Raise a NotInstalledError without dask.distributed; the context
+    raises the errors of `cluster.cluster_connection`.
     """
-    if isinstance(executor, str):
-        try:
-            from taichi_msm.sweeps.cluster import cluster_connection
-        except ImportError:
-            message = "a cluster needs dask.distributed, which is not installed; pip install distributed"
-            raise NotInstalledError(message) from None
-        with cluster_connection(executor, state.sweep, state.directory, progress) as cluster:
-            yield cluster
-    elif executor is not None:
-        yield executor
-    else:
-        pool = Pool(workers)
-        try:
-            yield pool
-        except BaseException:
-            pool.shutdown(cancel_futures=True)
-            raise
-        pool.shutdown()
+    if executor is None:
+        return Pool(workers)
+    if not isinstance(executor, str):
+        return nullcontext(executor)
+    try:
+        from taichi_msm.sweeps.cluster import cluster_connection
+    except ImportError:
+        message = "a cluster needs dask.distributed, which is not installed; pip install distributed"
+        raise NotInstalledError(message) from None
+    return cluster_connection(executor, state.sweep, state.directory, progress)
 
 
 def finish_sweep(state: SweepState, executor: Executor, progress: StageProgressCallback) -> tuple[list[str], list[str]]:

@@ -58,9 +58,8 @@ class ScriptEvent(Section):
         for name in ("at", "by", "to", "name"):
             given, required = getattr(self, name) is not None, REQUIRED_KEYS[self.do] == name
             if given != required:
-                raise scene_fault(
-                    f"missing; {self.do} needs it" if required else f"{self.do} takes none; remove it", name
-                )
+                fault = f"missing; {self.do} needs it" if required else f"{self.do} takes none; remove it"
+                raise scene_fault(fault, name)
         if self.name is not None and self.name not in SCRIPT_KEYS:
             raise scene_fault(f"there is no key '{self.name}' here; expected one of: {', '.join(SCRIPT_KEYS)}", "name")
         if self.seconds > 0 and self.do not in ("drag", "turn"):

@@ -39,12 +39,8 @@ from taichi_msm.view.tools import PositionControlledTool
 
 ADDRESS = "127.0.0.1"
 
-# File name and media type by the path of a request after the token.
-PAGE = {
-    "": ("index.html", "text/html"),
-    "style.css": ("style.css", "text/css"),
-    "view.js": ("view.js", "text/javascript"),
-}
+# Media types by the path of a request after the token, which is the name of a file; empty for index.html.
+PAGE = {"": "text/html", "style.css": "text/css", "view.js": "text/javascript"}
 
 HEADERS = {
     "Cache-Control": "no-store",
@@ -296,9 +292,7 @@ class Pacing:
     """Schedule of frames in real time, for a rate [1/s] and a clock that returns the time [s]."""
 
     def __init__(self, rate: float, clock: Callable[[], float]) -> None:
-        self._rate = rate
-        self._clock = clock
-        self._next = clock()
+        self._rate, self._clock, self._next = rate, clock, clock()
         # Start [s] of each recent picture, and number of frames simulated for it.
         self._pictures: deque[tuple[float, int]] = deque()
 
@@ -403,9 +397,8 @@ class _Page(_Guarded):
             return
         if name not in PAGE:
             raise HTTPError(404)
-        file, kind = PAGE[name]
-        self.set_header("Content-Type", f"{kind}; charset=utf-8")
-        self.write((files("taichi_msm.view") / "page" / file).read_bytes())
+        self.set_header("Content-Type", f"{PAGE[name]}; charset=utf-8")
+        self.write((files("taichi_msm.view") / "page" / (name or "index.html")).read_bytes())
 
 
 class _Connection(_Guarded, WebSocketHandler):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Sequence
+from contextlib import AbstractContextManager
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -59,7 +60,7 @@ def divide_frames(plan: Plan) -> tuple[Plan, int]:
     return plan_variant(plan, with_time(scene, **changes)), subframes
 
 
-class Session:
+class Session(AbstractContextManager["Session"]):
     """Interactive simulation of a scene with a tool; a context manager that saves a running film on exit.
 
     There are up to two tools. The force-controlled one has the force, falloff and offset of the first probe with a
@@ -102,16 +103,14 @@ class Session:
         self.tool = tool
         plan = self._with_tool(tool)
         self.scene = scene.model_copy(update={"probes": plan.scene.probes})
-        self._show_readings, self._show_keys = True, False
-        self._single_step = self._has_warned_of_length = self._material_changed = self.paused = False
+        self.frame_rate = scene.time.frames_per_second  # of the session [1/s]
+        self._show_readings, self._show_keys, self.paused = True, False, False
         # Elapsed frames, including those of pauses.
         self._elapsed = 0
         self._notice, self._notice_until = "", 0
-        self.divergence_error = ""  # message of the divergence that stopped the simulation
         # Moving average of the time to simulate a frame [s].
         self._frame_time_s = 0.0
-        # Largest force since the last reset [N].
-        self._max_felt_force = 0.0
+        self._reset_status()
         progress("compile")
         # One core is left for the browser: workers spin while they wait for each other.
         self._simulation = Simulation(plan, arch, threads, texture, max(1, available_threads() - 1))
@@ -124,10 +123,10 @@ class Session:
         self._drag_start: tuple[SheetPosition, NDArray[np.floating] | None] | None = None
         self._draw()
 
-    @property
-    def frame_rate(self) -> float:
-        """Frames per second of the session."""
-        return self.scene.time.frames_per_second
+    def _reset_status(self) -> None:
+        self._single_step = self._has_warned_of_length = self._material_changed = False
+        self._max_felt_force = 0.0  # since the last reset [N]
+        self.divergence_error = ""  # message of the divergence that stopped the simulation
 
     @property
     def frame(self) -> int:
@@ -165,9 +164,8 @@ class Session:
         frames = max(1, self.frame + bool(self.divergence_error))
         time = self.scene.time.model_copy(update={"duration": frames / self.frame_rate, "tolerance": None})
         probes = (*self._scene_probes, self.tool.recorded_probe(frames))
-        return self.scene.model_copy(
-            update={"probes": probes, "time": time, "render": self.viewport.recorded_render(time.duration)}
-        )
+        render = self.viewport.recorded_render(time.duration)
+        return self.scene.model_copy(update={"probes": probes, "time": time, "render": render})
 
     def handle(self, event: events.Event) -> None:
         """Process an event, with effect from the next frame on; raise a FilesError if a file cannot be saved."""
@@ -276,9 +274,6 @@ class Session:
         self._simulation.close()
         self._end_film()
 
-    def __enter__(self) -> Session:
-        return self
-
     def __exit__(self, *_: object) -> None:
         self.close()
 
@@ -354,10 +349,9 @@ class Session:
 
     def _handle_key(self, key: str) -> None:
         match key:
-            case "up":
-                self.handle(events.StrengthChange(events.STRENGTH_STEP))
-            case "down":
-                self.handle(events.StrengthChange(-events.STRENGTH_STEP))
+            case "up" | "down":
+                step = events.STRENGTH_STEP if key == "up" else -events.STRENGTH_STEP
+                self.tool.set_strength(self.tool.strength + step)
             case "c" | "t" | "o":
                 self.viewport.set_camera({"c": self.scene.render.main_camera, "t": "top", "o": "oblique"}[key])
                 self._rebase_drag()
@@ -398,9 +392,8 @@ class Session:
         plan = self._plan.with_probes((*self._scene_probes, tool.recorded_probe(0)))
         session_tools = [tool for tool in plan.tools if tool.probe == len(self._scene_probes)]
         if any(path_problems(plan.scene, session_tools, plan.grid)):
-            raise SceneError(
-                ["this tool cannot be position-controlled: its shaft points down into the sheet; turn it up"]
-            )
+            fault = "this tool cannot be position-controlled: its shaft points down into the sheet; turn it up"
+            raise SceneError([fault])
         return plan
 
     def _switch(self) -> None:
@@ -448,10 +441,6 @@ class Session:
         if self._position_tool is not None:
             self._position_tool.grid = plan.grid
 
-    def _reset_status(self) -> None:
-        self._single_step = self._has_warned_of_length = self._material_changed = False
-        self._max_felt_force, self.divergence_error = 0.0, ""
-
     def _end_film(self) -> None:
         film, self._film = self._film, None
         if film is None:
@@ -465,11 +454,9 @@ class Session:
     @property
     def _pulls(self) -> bool:
         """Whether the tool pulls, by its direction or the sign of the probe's force."""
-        tool = self.tool
-        return (
-            isinstance(tool, ForceControlledTool)
-            and tool.percent * probe_force(tool.probe, self.scene.sheet).force[2] > 0
-        )
+        if not isinstance(self.tool, ForceControlledTool):
+            return False
+        return self.tool.percent * probe_force(self.tool.probe, self.scene.sheet).force[2] > 0
 
     def _reading_lines(self) -> list[str]:
         speed = f"steps {1 / self.frame_rate / self._frame_time_s:.2g} x real time" if self._frame_time_s > 0 else ""
@@ -481,10 +468,8 @@ class Session:
         if isinstance(tool, PositionControlledTool):
             height = tool.height if tool.engaged else -tool.depth
             action = "grip" if tool.gripping else "press" if tool.engaged else "next press"
-            return [
-                f"{action} {format_length(abs(height))} {'up' if height > 0 else 'deep'}",
-                format_force(self.felt_force()),
-            ]
+            direction = "up" if height > 0 else "deep"
+            return [f"{action} {format_length(abs(height))} {direction}", format_force(self.felt_force())]
         action = "pull" if self._pulls else "push"
         percent = f"{action} {abs(tool.percent):.0f} %" if tool.percent else f"tool {tool.strength:.0f} %"
         displacement = self.displacement()

@@ -16,7 +16,7 @@ from taichi_msm.model.tool_force import control_points
 from taichi_msm.model.tools import SolidTool, build_tools, overlap, solid_tools
 from taichi_msm.scene.scene import Scene
 from taichi_msm.scene.sheet import Sheet
-from taichi_msm.scene.tools import Probe
+from taichi_msm.scene.tools import Instrument, Probe
 from taichi_msm.shapes import SHAPES
 
 # Time in which the force rises from 0 to full, or the tip moves from its highest to its deepest position [s].
@@ -42,7 +42,7 @@ def clear_start(probe: Probe, scene_probes: Sequence[Probe], scene: Scene) -> Sh
         return CENTRE
     others = [_capsule(each, scene.sheet) for each in scene_probes if each.instrument is not None]
     for start in STARTS:
-        hovering = Probe(path=((0.0, *start, _hover_height(probe)),), instrument=probe.instrument)
+        hovering = Probe(path=((0.0, *start, _hover_height(probe.instrument)),), instrument=probe.instrument)
         if all(overlap((_capsule(hovering, scene.sheet), each), scene.time.duration) is None for each in others):
             return start
     return CENTRE
@@ -61,9 +61,8 @@ def _capsule(probe: Probe, sheet: Sheet) -> SolidTool:
     return tool
 
 
-def _hover_height(probe: Probe) -> float:
-    assert probe.instrument is not None
-    return _round_height(HOVER_HEIGHT_RADII * probe.instrument.outer_radius)
+def _hover_height(instrument: Instrument) -> float:
+    return _round_height(HOVER_HEIGHT_RADII * instrument.outer_radius)
 
 
 def _round_height(height: float) -> float:
@@ -207,7 +206,7 @@ class PositionControlledTool:
         self.grid, self._sheet, self._radius = plan.grid, plan.scene.sheet, probe.instrument.outer_radius
         self._stride = SHAPES[probe.instrument.shape].max_stride * self._radius
         self._max_depth = min(MAX_DEPTH_RADII * self._radius, 0.25 * min(self._sheet.size))
-        self._start, self._hover_height = start, _hover_height(probe)
+        self._start, self._hover_height = start, _hover_height(probe.instrument)
         friction = probe.friction if "friction" in probe.model_fields_set else DEFAULT_FRICTION
         if plan.scene.time.at_rest and friction != "rough":
             friction = 0.0
@@ -231,11 +230,6 @@ class PositionControlledTool:
     def depth(self) -> float:
         """Depth of a press [m]; negative to lift a grip."""
         return self._max_depth * self.strength / 100
-
-    @property
-    def percent(self) -> float:
-        """Current depth of the tip [% of the largest depth]; negative above the sheet."""
-        return -100 * self.height / self._max_depth
 
     @property
     def gripping(self) -> bool:
