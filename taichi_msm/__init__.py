@@ -33,6 +33,7 @@ if TYPE_CHECKING:
     from taichi_msm.scene.render import Light, Render
     from taichi_msm.scene.scene import Scene, Time
     from taichi_msm.scene.sheet import Foundation, RelaxationBranch, Sheet, Springs, Stiffening, StiffnessMap, Tissue
+    from taichi_msm.scene.surface import Dome, Folds, HeightField, PointGrid, RestSurface, Tube
     from taichi_msm.scene.tools import Instrument, Probe
     from taichi_msm.solver.state import TipForce
     from taichi_msm.sweeps.runs import Outcome
@@ -56,6 +57,7 @@ _NAMES = {
     "scene.render": "Light Render",
     "scene.scene": "Scene Time",
     "scene.sheet": "Foundation RelaxationBranch Sheet Springs Stiffening StiffnessMap Tissue",
+    "scene.surface": "Dome Folds HeightField PointGrid RestSurface Tube",
     "scene.tools": "Instrument Probe",
     "solver.state": "TipForce",
     "sweeps.runs": "Outcome",
@@ -65,6 +67,7 @@ _NAMES = {
 __all__ = ["ArgumentError", "DeviceError", "DivergedError", "FilesError", "MsmError", "NotInstalledError", "SceneError"]
 __all__ += ["Camera", "Distortion", "Foundation", "Instrument", "Intrinsics", "Light", "Pose", "Probe"]
 __all__ += ["RelaxationBranch", "Render", "Scene", "Sheet", "Springs", "Stiffening", "StiffnessMap", "Time", "Tissue"]
+__all__ += ["Dome", "Folds", "HeightField", "PointGrid", "RestSurface", "Tube"]
 __all__ += ["Flow", "Labels", "Outcome", "Playback", "Sight", "Simulation", "Surface", "TipForce"]
 __all__ += ["FitResult", "FittedMap", "Gradient"]
 __all__ += ["export", "fit", "gradient", "load_scene", "resume", "run", "sweep"]

@@ -15,6 +15,7 @@ LAYERS = [
     {"arithmetic", "errors", "plot_style", "version"},
     {"dual", "system"},
     {"images", "integrators", "laws", "lenses", "shapes"},
+    {"array_files"},
     {"camera_files"},
     {"scene"},
     {"model"},

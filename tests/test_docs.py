@@ -27,7 +27,7 @@ from taichi_msm.exports.formats import FORMATS
 from taichi_msm.load.scene_file import load_scene, schema
 from taichi_msm.runs.run import run
 from taichi_msm.runs.writer import ErrorRecord, RunRecord
-from taichi_msm.scene import camera, render, scene, sheet, tools
+from taichi_msm.scene import camera, render, scene, sheet, surface, tools
 from taichi_msm.scene.outputs import OUTPUTS
 from taichi_msm.scene.section import Section
 from taichi_msm.sweeps import sweep
@@ -171,6 +171,8 @@ def test_descriptions_of_keys_contain_their_limits() -> None:
                 assert "above 0" in key["expects"], key
             elif low == 0 and high > 1e20:
                 assert "0 or more" in key["expects"], key
+            elif low == -1e30:
+                assert "a number other than 0" in key["expects"], key
             elif (above := key.get("exclusiveMinimum")) is not None:
                 assert f"above {above:g} and below {key['exclusiveMaximum']:g}" in key["expects"], key
             else:
@@ -180,7 +182,7 @@ def test_descriptions_of_keys_contain_their_limits() -> None:
 
 
 def test_sections_of_a_scene_are_exported() -> None:
-    values = [item for module in (camera, render, scene, sheet, tools) for item in vars(module).items()]
+    values = [item for module in (camera, render, scene, sheet, surface, tools) for item in vars(module).items()]
     sections = {name for name, value in values if isinstance(value, type) and issubclass(value, Section)}
     assert {name for name in sections if not name.startswith("_")} - {"Section"} <= set(taichi_msm.__all__)
 

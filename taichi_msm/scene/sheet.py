@@ -27,7 +27,7 @@ from taichi_msm.scene.section import (
     key,
     scene_fault,
 )
-from taichi_msm.scene.surface import PointGrid, Surface
+from taichi_msm.scene.surface import PointGrid, RestSurface
 
 
 class Sheet(Section):
@@ -44,7 +44,7 @@ class Sheet(Section):
         "surface.points, which has its own",
         "two numbers above 0: [height, width] in metres",
     )
-    surface: Surface | None = key(
+    surface: RestSurface | None = key(
         None, "the sheet at rest, where it is not flat", "a mapping with one of height, tube, dome, points"
     )
     mass: Positive | None = key(

@@ -126,7 +126,7 @@ class PointGrid(Section):
         )
 
 
-class Surface(Section):
+class RestSurface(Section):
     """The sheet at rest, where it is not flat; exactly one of its kinds."""
 
     model_config = ConfigDict(
@@ -164,7 +164,7 @@ class Surface(Section):
         section = self.height or self.points
         return section.file if section else ""
 
-    def with_path(self, path: Callable[[str], str]) -> Surface:
+    def with_path(self, path: Callable[[str], str]) -> RestSurface:
         """Return a copy with the path p of the file, if the kind has one, replaced by `path(p)`."""
         section = self.height or self.points
         return (
