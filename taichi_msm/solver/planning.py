@@ -65,6 +65,9 @@ MAX_COMPANION_FRACTION = 2 / 5
 # Range of lengths whose squares, and products of squares, f32 can represent [m].
 MIN_F32_LENGTH_M, MAX_F32_LENGTH_M = 1e-15, 1e17
 
+# Range of lengths whose fourth powers f32 can represent, as in the springs of a curved sheet [m].
+CURVED_F32_LENGTHS_M = 1e-9, 1e9
+
 # Prevents n + 1 steps due to rounding in a frame of exactly n stable steps.
 ROUNDING_MARGIN = 1 - 1e-12
 
@@ -235,11 +238,12 @@ def precision_problems(plan: Plan) -> Iterator[Problem]:
     if plan.grid.precision == "f64":
         return
     rest, step, mass = rest_of(plan.scene.sheet), plan.grid.step, plan.material.mass
-    if rest.shortest_side < MIN_F32_LENGTH_M or rest.extent > MAX_F32_LENGTH_M:
+    least, most = (MIN_F32_LENGTH_M, MAX_F32_LENGTH_M) if rest.is_flat else CURVED_F32_LENGTHS_M
+    if rest.shortest_side < least or rest.extent > most:
         yield Problem(
             ("sheet", "size"),
             f"cells of {rest.shortest_side:g} m in a sheet of {rest.extent:g} m leave the range of f32, "
-            f"{MIN_F32_LENGTH_M:g} to {MAX_F32_LENGTH_M:g} m; take time.precision: f64",
+            f"{least:g} to {most:g} m; take time.precision: f64",
         )
     gain = step**2 / mass
     if not MIN_F32_LENGTH_M**2 < gain < MAX_F32_LENGTH_M**2:
