@@ -121,9 +121,9 @@ def fit_map(
     if (coarse_plan := coarser_plan(plan)) is not None:
         coarse_factors = MapGrid(settings.resolution, _cells(coarse_plan)).factors(start[:cell_count])
         coarse_model = PointModel(coarse_plan.scene, observations, coarse_plan.grid.frames + 1)
-        coarse_points = coarse_model.points(Adjoint(coarse_plan, device).run(coarse_factors, report_progress))
+        coarse_points = coarse_model.on_sheet(Adjoint(coarse_plan, device).run(coarse_factors, report_progress))
         # Richardson extrapolation of order 2, from half the cells per side.
-        differences = (coarse_model.observe(coarse_points) - initial)[observations.known] / 3.0
+        differences = (coarse_model.predict(coarse_points) - initial)[observations.known] / 3.0
         mesh_shift = float(np.sqrt(np.nanmean(differences**2)))
     sigma = math.hypot(observations.sigma, mesh_shift)
     force_limits = settings.force.limits if settings.force else None

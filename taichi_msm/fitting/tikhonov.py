@@ -133,7 +133,7 @@ class MapSearch:
         self.runs += 1
         cells, scene = x[: self._cells], with_scaled_forces(self._model.scene, x[self._cells :])
         points = self._model.points(self._adjoint.run(self._grid.factors(cells), self._pause, scene))
-        predicted = self._model.observe(points)
+        predicted = self._observations.observe(self._model.scene, points)
         if not np.isfinite(predicted[self._observations.known]).all():
             fault = "an observed point is behind the eye of the camera for some maps"
             remedy = "give NaN in its place, or narrower --bounds"
