@@ -25,7 +25,16 @@ from taichi_msm.fitting.machine_fit import FittedTest, contact_notes, explanatio
 from taichi_msm.fitting.machine_model import TABLE_OPTIONS, MachineProblem, read_machine_problem, table_paths
 from taichi_msm.fitting.observation import Array, ErrorCorrelation, Observation
 from taichi_msm.fitting.outliers import LeftOut, leave_out
-from taichi_msm.fitting.parameters import Bounds, Method, Parameter, as_data, make_parameters, require_types, rounded
+from taichi_msm.fitting.parameters import (
+    Bounds,
+    Method,
+    Parameter,
+    Request,
+    as_data,
+    make_parameters,
+    require_types,
+    rounded,
+)
 from taichi_msm.fitting.points import PointObservation
 from taichi_msm.fitting.predict import FitProblem, Prediction, Runs, without_outputs
 from taichi_msm.fitting.profiles import Profile, Profiler, quadratic_profile
@@ -107,11 +116,11 @@ def fit(
             raise SceneError([f"{section}.tolerance: {tolerance:g} {fault}"])
     if repeated := [key for n, key in enumerate(free) if key in free[:n]]:
         raise SceneError([f"--free {repeated[0]}: given twice; leave one of them out"])
+    request, settings = Request(initial, free, bounds or {}, forces, method), None
     if tables := table_paths(observed):
-        problem: FitProblem = read_machine_problem(tables, initial, free, bounds or {}, forces, method)
-        settings = None
+        problem: FitProblem = read_machine_problem(tables, request)
     else:
-        problem, settings = _read_problem(observed, initial, free, bounds or {}, forces, method)
+        problem, settings = _read_problem(observed, request)
     with ExitStack() as stack:
         if directory is not None:
             # From here on an interruption is an exception, which removes the unfinished files.
@@ -134,19 +143,13 @@ def fit(
     return result
 
 
-def _read_problem(
-    observed: Any,
-    initial: Scene,
-    free: Sequence[str],
-    bounds: Mapping[str, Bounds],
-    forces: tuple[str | Path, float] | None,
-    method: Method,
-) -> tuple[FitProblem, MapSettings | None]:
+def _read_problem(observed: Any, request: Request) -> tuple[FitProblem, MapSettings | None]:
     """Return the problem of a fit to points and forces, and the settings of its map, None for a fit of numbers."""
+    initial, free, bounds, forces, method = request
     points = read_observations(observed, initial.time.frames_per_second).with_sigma(method.get("sigma"))
     if unused := [name for name in TABLE_OPTIONS if method.get(name)]:
         raise SceneError([f"--{unused[0]}: only for tables of a testing machine; leave it out"])
-    settings = map_settings(initial, free, bounds, method.get("resolution"))
+    settings = map_settings(request)
     options = {"forces": forces, **{name: method.get(name) for name in ("robust", "profile", "correlation", "drift")}}
     if settings is not None and (conflicting := [name for name, value in options.items() if value]):
         raise SceneError([f"--free {KEY}: --{conflicting[0]} is only for fits of numbers; leave it out"])
