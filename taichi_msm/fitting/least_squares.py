@@ -8,7 +8,7 @@ alternately with the parameters.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -90,6 +90,15 @@ class Misfit:
         rho = 2 * OUTLIER_SIGMAS**2 * (np.sqrt(self.robust_factor(residuals)) - 1) if self.robust else residuals**2
         return float(np.sum(rho)) / 2
 
+    def total(self, predicted: Prediction, scales: Scales) -> float:
+        """Return the cost of a prediction."""
+        return self.cost(self.residuals(predicted, scales))
+
+    def two_best(self, predictions: Iterable[tuple[Array, Prediction | None]], scales: Scales) -> list[Array]:
+        """Return the two coordinates of lowest cost; None is the prediction of a failed run."""
+        costs = [(self.total(predicted, scales), x.tolist()) for x, predicted in predictions if predicted is not None]
+        return [np.array(x) for _, x in sorted(costs)[:2]]
+
     def deviations(self, predicted: Prediction, parameter_count: int) -> list[float]:
         """Return the standard deviation of every observation, in its unit, estimated from its residuals."""
         deviations = []
@@ -129,12 +138,11 @@ class Search:
             return solution
         starts = self.alternative_starts()
         self._runs.expected += len(starts)
-        predictions = enumerate(self._runs.predict_many(starts))
-        costs = [(self._cost(predicted, solution.scales), n) for n, predicted in predictions if predicted is not None]
-        for _, n in sorted(costs)[:2]:
-            candidate = self.refine(starts[n])
+        predictions = zip(starts, self._runs.predict_many(starts), strict=True)
+        for x in self.misfit.two_best(predictions, solution.scales):
+            candidate, scales = self.refine(x), solution.scales
             # Costs are comparable only with the same sigma.
-            if self._cost(candidate.predicted, solution.scales) < self._cost(solution.predicted, solution.scales):
+            if self.misfit.total(candidate.predicted, scales) < self.misfit.total(solution.predicted, scales):
                 solution = candidate
             if self.fits_well(solution):
                 break
@@ -239,9 +247,6 @@ class Search:
             (x_first, first), (x_second, second) = [*sides, (x[n], predicted)][:2]
             columns.append((self.misfit.vector(first) - self.misfit.vector(second)) / (x_first - x_second))
         return np.stack(columns, axis=1)
-
-    def _cost(self, predicted: Prediction, scales: Scales) -> float:
-        return self.misfit.cost(self.misfit.residuals(predicted, scales))
 
     def alternative_starts(self) -> list[Array]:
         """Return a Sobol sequence of starts within the bounds, at least 8 per parameter, or 8 for machine tests."""

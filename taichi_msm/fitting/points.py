@@ -59,7 +59,7 @@ class PointModel(ObservationModel):
 
     def predict(self, recorded: Array) -> Array:
         """Return the values, shape (N, T, 3 or 2); `recorded`: points at all frames [m], shape (frames, N, 3)."""
-        return self.observe(self.interpolate(recorded))
+        return self._observed.observe(self.scene, self.interpolate(recorded))
 
     def motion(self, recorded: Array) -> Array:
         """Return the largest displacement at every frame [m], shape (frames,); `recorded`: as for `predict`."""
@@ -78,10 +78,6 @@ class PointModel(ObservationModel):
     def points(self, position: Array) -> Array:
         """Return the observed points [m], shape (N, T, 3); `position`: shape (frames, rows, cols, 3)."""
         return self.interpolate(self.on_sheet(position))
-
-    def observe(self, points: Array) -> Array:
-        """Convert points [m], shape (N, T, 3), to values, shape (N, T, 3 or 2), NaN behind the camera."""
-        return self._observed.observe(self.scene, points)
 
     def backward(self, points: Array, gradient: Array) -> Array:
         """Return the gradient of a loss by the positions of all frames, shape (frames, rows, cols, 3).
