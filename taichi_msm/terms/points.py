@@ -10,7 +10,6 @@ from typing import Any, NamedTuple
 
 from taichi_msm.terms.base import BY_COLUMN, DY, TOP_Y, KernelConfig
 
-
 # Prevents a division by 0; representable in f32.
 MIN_INVERSE = 1e-30
 
