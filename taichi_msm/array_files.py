@@ -6,7 +6,8 @@ import hashlib
 import io
 import zipfile
 from collections.abc import Callable, Sequence
-from typing import TYPE_CHECKING, Any, NamedTuple
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any
 
 from taichi_msm.images import PictureError, actual_path
 from taichi_msm.system.files import read_regular
@@ -20,10 +21,11 @@ ARRAY_SUFFIXES = (".npy", ".npz")
 MAX_BYTES = 2**29
 
 
-class ArrayFile(NamedTuple):
+@dataclass(frozen=True)
+class ArrayFile:
     """Numbers of a file in metres."""
 
-    values: NDArray[Any]  # float64
+    values: NDArray[Any] = field(compare=False)  # float64; they follow from the file and its unit
     sha256: str  # of the file
     step: float  # distance of two neighbouring values that the file can hold [m]; 0 for floating-point numbers
 
