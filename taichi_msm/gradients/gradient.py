@@ -163,9 +163,7 @@ def gradient(scene: Scene | Mapping[str, Any], loss: Loss, threads: int | None =
         raise ArgumentError(f"loss: its value is {description}; return a finite number")
     slope = as_array(by_position, "slope")
     if not is_real_array(slope, position.shape) or not np.isfinite(slope).all():
-        raise ArgumentError(
-            f"the loss's derivative: {slope.dtype} of shape {slope.shape}; take finite numbers of shape "
-            f"{position.shape}, that of the positions"
-        )
+        remedy = f"take finite numbers of shape {position.shape}, that of the positions"
+        raise ArgumentError(f"the loss's derivative: {slope.dtype} of shape {slope.shape}; {remedy}")
     derivatives = adjoint.backward(np.asarray(slope, float))
     return Gradient(derivatives.numbers, derivatives.maps, float(value))
