@@ -143,7 +143,11 @@ class RestSurface(Section):
     @property
     def kind(self) -> str:
         """Name of the kind."""
-        return next(name for name, value in self if value is not None)
+        return self._kinds()[0]
+
+    def _kinds(self) -> list[str]:
+        """Names of the given kinds. Iteration over a section also yields cached properties."""
+        return [name for name in type(self).model_fields if getattr(self, name) is not None]
 
     @cached_property
     def file(self) -> ArrayFile | None:
@@ -156,7 +160,7 @@ class RestSurface(Section):
         return (self.kind, "file") if self.height or self.points else ()
 
     def _unused_keys(self) -> Collection[str]:
-        return [name for name, value in self if value is None]
+        return type(self).model_fields.keys() - self._kinds()
 
     @property
     def path(self) -> str:
@@ -175,7 +179,7 @@ class RestSurface(Section):
 
     @model_validator(mode="after")
     def _check_one_kind(self) -> Self:
-        given = [name for name, value in self if value is not None]
+        given = self._kinds()
         if not given:
             raise scene_fault("is empty; expected one of height, tube, dome, points")
         if len(given) > 1:
