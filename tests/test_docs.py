@@ -11,8 +11,8 @@ import shutil
 import subprocess
 import sys
 from collections.abc import Iterator
+from contextlib import nullcontext
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any, get_type_hints
 
 import numpy as np
@@ -116,8 +116,7 @@ def small_scenes(device: Device, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
     monkeypatch.setattr(process, "available_threads", lambda: device.threads)
     # All sweeps share one process.
     pool = Pool(1)
-    shared = SimpleNamespace(submit=pool.submit, shutdown=lambda cancel_futures=False: None)
-    monkeypatch.setattr(sweep, "Pool", lambda workers: shared)
+    monkeypatch.setattr(sweep, "Pool", lambda workers: nullcontext(pool))
     yield tmp_path
     pool.shutdown()
 

@@ -63,7 +63,7 @@ def surface_notes(scene: Scene) -> Iterator[str]:
     if scene.tissue is not None and isotropy["mean"] > NOTED_ISOTROPY_ERROR:
         yield (
             f"sheet.surface: the springs deviate from isotropic tissue by {isotropy['mean']:.3g} on the mean, up to "
-            f"{isotropy['worst']:.3g}; {isotropy_remedy(rest)}"
+            f"{isotropy['worst']:.3g}; {isotropy_remedy(rest, surface.kind)}"
         )
     if surface.height and file and file.step > NOTED_STEP * side:
         yield (
