@@ -28,7 +28,7 @@ class ArrayFile(NamedTuple):
 
     values: NDArray[Any]  # float64
     sha256: str  # of the file
-    step: float  # distance of two neighbouring values that the file can hold [m]; 0 for floating-point numbers
+    step: float  # smallest difference of two values [m]; 0 for floating-point numbers
 
 
 def read_array_file(
@@ -60,8 +60,15 @@ def read_array_file(
     if not is_small.all():
         at = ", ".join(map(str, np.unravel_index(int((~is_small).argmax()), array.shape)))
         raise PictureError(f"{path}: [{at}] is {array[~is_small][0]}", f"give finite numbers, of up to {MAX_M:g} m")
-    step = 0.0 if array.dtype.kind == "f" else unit
-    return ArrayFile(values, hashlib.sha256(data).hexdigest(), step)
+    return ArrayFile(values, hashlib.sha256(data).hexdigest(), unit * smallest_step(array))
+
+
+def smallest_step(values: NDArray[Any]) -> float:
+    """Return the smallest difference of two integers; 0 for floating-point numbers, and if all are equal."""
+    import numpy as np
+
+    steps = np.diff(np.unique(values.astype(float))) if values.dtype.kind in "iu" else np.empty(0)
+    return float(steps.min()) if len(steps) else 0.0
 
 
 def _load(path: str, data: bytes, names: Sequence[str]) -> NDArray[Any]:
