@@ -82,7 +82,9 @@ def _load(path: str, data: bytes, names: Sequence[str]) -> NDArray[Any]:
         members = {info.filename.removesuffix(".npy"): info for info in archive.infolist()}
         name = next((name for name in names if name in members), next(iter(members)) if len(members) == 1 else None)
         if name is None:
-            raise PictureError(f"{path} has {', '.join(sorted(members)[:9]) or 'no array'}", f"name one of its arrays {names[0]}")
+            raise PictureError(
+                f"{path} has {', '.join(sorted(members)[:9]) or 'no array'}", f"name one of its arrays {names[0]}"
+            )
         if members[name].file_size > MAX_BYTES:
             raise PictureError(f"{path}: {name} has {members[name].file_size:,} bytes", f"take at most {MAX_BYTES:,}")
         with archive.open(members[name]) as member:

@@ -91,7 +91,9 @@ def describe_surface(plan: Plan) -> Iterator[str]:
         f"{low if low == high else f'{low} to {high}'} degrees"
     )
     worst = describe_place(rest.isotropy_errors == rest.isotropy_errors.max())
-    line = f"surface: isotropy error {isotropy['mean']:.2g} on the mean, at most {isotropy['worst']:.2g} (cell at {worst})"
+    line = (
+        f"surface: isotropy error {isotropy['mean']:.2g} on the mean, at most {isotropy['worst']:.2g} (cell at {worst})"
+    )
     # Rectangles and rhombi are exact but for rounding.
     line = line if isotropy["worst"] > 1e-9 else "surface: isotropy error 0"
     clamped = record["clamped"]

@@ -82,7 +82,9 @@ class Sheet(Section):
             except ValidationError:
                 points = (2, 2)  # The faults of the section come alone.
             if max(points) > MAX_POINTS:
-                text = f"{grid.file} has {points[0]} x {points[1]} points; set sheet.points, at most {MAX_POINTS} a side"
+                text = (
+                    f"{grid.file} has {points[0]} x {points[1]} points; set sheet.points, at most {MAX_POINTS} a side"
+                )
                 raise scene_fault(text, "surface", "points", "file")
         return {**data, "points": points, "size": (1.0, 1.0)}
 
