@@ -6,7 +6,8 @@ import hashlib
 import io
 import zipfile
 from collections.abc import Callable, Sequence
-from typing import TYPE_CHECKING, Any, NamedTuple
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
 
 from taichi_msm.images import PictureError, actual_path
 from taichi_msm.system.files import read_regular
@@ -23,8 +24,9 @@ MAX_M = 1e6
 MAX_BYTES = 2**29
 
 
-class ArrayFile(NamedTuple):
-    """Numbers of a file in metres."""
+@dataclass(frozen=True, eq=False)
+class ArrayFile:
+    """Numbers of a file in metres; equal to itself alone, so that sections of scenes that keep it can be compared."""
 
     values: NDArray[Any]  # float64
     sha256: str  # of the file

@@ -90,12 +90,11 @@ def describe_surface(plan: Plan) -> Iterator[str]:
         f"{rest.longest_side:.3g} m, at most {aspect.max():.3g} times as long as wide, with sides at "
         f"{low if low == high else f'{low} to {high}'} degrees"
     )
-    worst = describe_place(rest.isotropy_errors == rest.isotropy_errors.max())
-    line = (
-        f"surface: isotropy error {isotropy['mean']:.2g} on the mean, at most {isotropy['worst']:.2g} (cell at {worst})"
-    )
+    line = "surface: isotropy error 0"
     # Rectangles and rhombi are exact but for rounding.
-    line = line if isotropy["worst"] > 1e-9 else "surface: isotropy error 0"
+    if isotropy["worst"] > 1e-9:
+        worst = describe_place(rest.isotropy_errors == rest.isotropy_errors.max())
+        line = f"surface: isotropy error {isotropy['mean']:.2g} on the mean, {isotropy['worst']:.2g} at {worst}"
     clamped = record["clamped"]
     count = f"{clamped} cells are" if clamped > 1 else "a cell is"
     yield f"{line}; {count} clamped, as a spring would need a stiffness below 0" if clamped else line
