@@ -44,6 +44,7 @@ from taichi_msm.errors import DivergedError, Pause, ProgressCallback, SceneError
 from taichi_msm.model.plan import Plan
 from taichi_msm.model.rest import rest_of
 from taichi_msm.model.sheet import MAX_CELL_ASPECT, Maps, cell_aspect_ratio
+from taichi_msm.model.surface_checks import surface_problems
 from taichi_msm.model.tool_force import sum_probe_forces
 from taichi_msm.model.tools import overlap, solid_tools
 from taichi_msm.scene.scene import Scene
@@ -96,7 +97,7 @@ class MeshEstimate:
 def coarser_plan(plan: Plan, ratio: float = 0.5) -> Plan | None:
     """Plan the scene on a mesh with a ratio of the cells per side, and with the same total forces.
 
-    Return None without tissue, with too few mass points, or with cells beyond the largest aspect ratio.
+    Return None without tissue, with too few mass points, or with cells that are not allowed.
     """
     scene = plan.scene
     if scene.tissue is None or min(scene.sheet.points) < MIN_POINTS_PER_SIDE:
@@ -111,7 +112,7 @@ def coarser_plan(plan: Plan, ratio: float = 0.5) -> Plan | None:
     # Numbers of cells are rounded up or down, to keep the aspect ratio of the cells below its limit.
     options = product(*({math.ceil(count) + 1, math.floor(count) + 1} for count in cells))
     scenes = [with_points(scene, (rows, cols)) for rows, cols in options]
-    valid = [option for option in scenes if cell_aspect_ratio(option.sheet) <= MAX_CELL_ASPECT]
+    valid = [option for option in scenes if _allows_cells(option)]
     if not valid:
         return None
 
@@ -121,6 +122,12 @@ def coarser_plan(plan: Plan, ratio: float = 0.5) -> Plan | None:
     coarse = min(valid, key=lambda option: (deviation(option), option.sheet.points))
     probes = tuple(_with_equal_force(probe, scene.sheet, coarse.sheet) for probe in scene.probes)
     return plan_variant(plan, coarse.model_copy(update={"probes": probes}))
+
+
+def _allows_cells(scene: Scene) -> bool:
+    if scene.sheet.surface:
+        return not any(surface_problems(scene))
+    return cell_aspect_ratio(scene.sheet) <= MAX_CELL_ASPECT
 
 
 def mesh_companion_plan(plan: Plan) -> Plan | None:

@@ -222,7 +222,7 @@ class Draft:
         is_overridden = any(key[:n] in self._overridden for n in range(1, len(key) + 1))
         if not is_overridden and not is_below(folder / path, folder):
             remedy = ", or name it with --image" if key == IMAGE_KEY else ""
-            noun = "the picture" if key in PICTURE_KEYS else "it"
+            noun = "the picture" if key in PICTURE_KEYS and key not in SURFACE_KEYS else "it"
             message = f"{path} is not below the scene's folder; put {noun} there{remedy}"
             self.problems.append((self._origin(key), Problem(key, message)))
             del section[key[-1]]
