@@ -122,6 +122,9 @@ ENTRIES = list(dict.fromkeys(output.entry for output in OUTPUTS.values()))
 # Outputs with a file for every frame, by their folders.
 SERIES_FOLDERS = {output.result: output for output in OUTPUTS.values() if output.is_series}
 
+# Positions, areas and normals at rest of a curved sheet.
+REST_FILE = "rest.npz"
+
 # Regular expressions for the paths of all files of a run. Outputs of a named camera are in its folder.
 _CAMERA_PATTERNS = [
     *(output.pattern for output in OUTPUTS.values() if output.is_camera_output),
@@ -131,12 +134,9 @@ RESULT_PATTERNS = (
     *_CAMERA_PATTERNS,
     *(f"{CAMERA_NAME}/{pattern}" for pattern in _CAMERA_PATTERNS),
     *(output.pattern for output in OUTPUTS.values() if not output.is_camera_output),
+    re.escape(REST_FILE),
     re.escape(RUN_RECORD),
 )
-
-
-# Positions, areas and normals at rest of a curved sheet.
-REST_FILE = "rest.npz"
 
 
 def result_names(folders: Mapping[str, Collection[str]]) -> list[str]:
