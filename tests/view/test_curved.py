@@ -1,4 +1,4 @@
-"""Sessions of sheets that are curved at rest: heights along the normal, places on the surface, records with equal bits."""
+"""Sessions of curved sheets: heights along the normal, places on the surface, records with equal bits."""
 
 from __future__ import annotations
 
@@ -70,7 +70,7 @@ def position_tool(session: Session) -> PositionControlledTool:
 
 
 def height_and_place(session: Session) -> tuple[float, NDArray[np.float64]]:
-    """Return the height of the tool's lowest point along the normal, and the point of the sheet at rest below it [m]."""
+    """Return the height of the tool's lowest point, and the point of the sheet at rest below it [m]."""
     rest = rest_of(session.scene.sheet)
     assert isinstance(rest, CurvedRest)
     at = np.array(session.tool.position)[None]
