@@ -6,7 +6,7 @@ import hashlib
 import io
 import zipfile
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 from taichi_msm.images import PictureError, actual_path
@@ -17,17 +17,20 @@ if TYPE_CHECKING:
 
 ARRAY_SUFFIXES = (".npy", ".npz")
 
+# Largest magnitude of a number [m].
+MAX_M = 1e6
+
 # Largest file, and largest array in it [bytes]: 4096 x 4096 points of three float64 numbers, with some margin.
 MAX_BYTES = 2**29
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class ArrayFile:
-    """Numbers of a file in metres."""
+    """Numbers of a file in metres; equal to itself alone, so that sections of scenes that keep it can be compared."""
 
-    values: NDArray[Any] = field(compare=False)  # float64; they follow from the file and its unit
+    values: NDArray[Any]  # float64
     sha256: str  # of the file
-    step: float  # distance of two neighbouring values that the file can hold [m]; 0 for floating-point numbers
+    step: float  # smallest difference of two values [m]; 0 for floating-point numbers
 
 
 def read_array_file(
@@ -44,21 +47,30 @@ def read_array_file(
     except (OSError, ValueError) as error:
         reason = getattr(error, "strerror", None) or str(error)
         raise PictureError(f"{path}: {reason.lower()}", "name an .npy or .npz file that can be read") from None
-    remedy = f"save an array of numbers of shape {shapes} with numpy.save"
+    remedy = f"with numpy.save, save an array of numbers of shape {shapes}"
     try:
         array = _load(path, data, names)
-    except (ValueError, OSError, EOFError, zipfile.BadZipFile, NotImplementedError, RuntimeError):
+    except (ValueError, OSError, EOFError, MemoryError, zipfile.BadZipFile, NotImplementedError, RuntimeError):
         raise PictureError(f"{path} is not an .npy or .npz file of numbers", remedy) from None
     if array.dtype.kind not in "fiu":
-        raise PictureError(f"{path}: {array.dtype} is not numeric", remedy)
+        raise PictureError(f"{path} has an array of {array.dtype}", remedy)
     if not is_shape(array.shape) or 0 in array.shape:
-        raise PictureError(f"{path}: shape {array.shape}", remedy)
-    finite = np.isfinite(array)
-    if not finite.all():
-        at = ", ".join(map(str, np.unravel_index(int((~finite).argmax()), array.shape)))
-        raise PictureError(f"{path}: [{at}] is {array[~finite][0]}", "give a finite number there")
-    step = 0.0 if array.dtype.kind == "f" else unit
-    return ArrayFile(array.astype(np.float64) * unit, hashlib.sha256(data).hexdigest(), step)
+        raise PictureError(f"{path} has an array of shape {array.shape}", remedy)
+    values = array.astype(np.float64) * unit
+    # Also NaN is not small.
+    is_small = np.abs(values) <= MAX_M
+    if not is_small.all():
+        at = ", ".join(map(str, np.unravel_index(int((~is_small).argmax()), array.shape)))
+        raise PictureError(f"{path}: [{at}] is {array[~is_small][0]}", f"give finite numbers, of up to {MAX_M:g} m")
+    return ArrayFile(values, hashlib.sha256(data).hexdigest(), unit * smallest_step(array))
+
+
+def smallest_step(values: NDArray[Any]) -> float:
+    """Return the smallest difference of two integers; 0 for floating-point numbers, and if all are equal."""
+    import numpy as np
+
+    steps = np.diff(np.unique(values.astype(float))) if values.dtype.kind in "iu" else np.empty(0)
+    return float(steps.min()) if len(steps) else 0.0
 
 
 def _load(path: str, data: bytes, names: Sequence[str]) -> NDArray[Any]:
@@ -72,7 +84,9 @@ def _load(path: str, data: bytes, names: Sequence[str]) -> NDArray[Any]:
         members = {info.filename.removesuffix(".npy"): info for info in archive.infolist()}
         name = next((name for name in names if name in members), next(iter(members)) if len(members) == 1 else None)
         if name is None:
-            raise PictureError(f"{path} has {', '.join(sorted(members)[:9])}", f"name one of its arrays {names[0]}")
+            raise PictureError(
+                f"{path} has {', '.join(sorted(members)[:9]) or 'no array'}", f"name one of its arrays {names[0]}"
+            )
         if members[name].file_size > MAX_BYTES:
             raise PictureError(f"{path}: {name} has {members[name].file_size:,} bytes", f"take at most {MAX_BYTES:,}")
         with archive.open(members[name]) as member:

@@ -319,9 +319,9 @@ def _digits(number: float, digits: int = 1) -> str:
 def _mesh_remedy(plan: Plan, mesh: MeshEstimate, affords: Callable[[Plan], bool]) -> str:
     """Suggest a remedy for the mesh error: a finer mesh with at most `MAX_POINTS_RATIO` times the mass points."""
     if mesh.doubt == WRINKLING:
-        return (
-            "hold every side and set tissue.bending or tissue.pretension; without them, a finer mesh has finer wrinkles"
-        )
+        # A curved sheet has no bending.
+        remedies = "tissue.pretension" if plan.scene.sheet.surface else "tissue.bending or tissue.pretension"
+        return f"hold every side and set {remedies}; without, a finer mesh has finer wrinkles"
     refinement = min(math.sqrt(mesh.error / (REMEDY_THRESHOLD / 2)), math.sqrt(MAX_POINTS_RATIO))
     rows, cols = (math.ceil((count - 1) * refinement) + 1 for count in plan.scene.sheet.points)
     if max(rows, cols) < MAX_POINTS and affords(plan_variant(plan, with_points(plan.scene, (rows, cols)))):

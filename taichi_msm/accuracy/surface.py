@@ -63,7 +63,7 @@ def surface_notes(scene: Scene) -> Iterator[str]:
     if scene.tissue is not None and isotropy["mean"] > NOTED_ISOTROPY_ERROR:
         yield (
             f"sheet.surface: the springs deviate from isotropic tissue by {isotropy['mean']:.3g} on the mean, up to "
-            f"{isotropy['worst']:.3g}; {isotropy_remedy(rest)}"
+            f"{isotropy['worst']:.3g}; {isotropy_remedy(rest, surface.kind)}"
         )
     if surface.height and file and file.step > NOTED_STEP * side:
         yield (
@@ -84,15 +84,20 @@ def describe_surface(plan: Plan) -> Iterator[str]:
     cells, (rows, cols) = rest.cells, plan.scene.sheet.points
     aspect = np.maximum(cells.side_a / cells.side_b, cells.side_b / cells.side_a)
     angles, isotropy = np.degrees(np.arccos(cells.cosine)), record["isotropy_error"]
+    low, high = f"{angles.min():.0f}", f"{angles.max():.0f}"
     yield (
         f"surface: {record['kind']}, {rows} x {cols} points, cells of {rest.shortest_side:.3g} to "
-        f"{rest.longest_side:.3g} m, at most {aspect.max():.3g} times as long as wide, at {angles.min():.0f} to "
-        f"{angles.max():.0f} degrees"
+        f"{rest.longest_side:.3g} m, at most {aspect.max():.3g} times as long as wide, with sides at "
+        f"{low if low == high else f'{low} to {high}'} degrees"
     )
-    worst = describe_place(rest.isotropy_errors == rest.isotropy_errors.max())
-    line = f"surface: isotropy error {isotropy['mean']:.3g} on the mean, at most {isotropy['worst']:.3g}, at {worst}"
+    line = "surface: isotropy error 0"
+    # Rectangles and rhombi are exact but for rounding.
+    if isotropy["worst"] > 1e-9:
+        worst = describe_place(rest.isotropy_errors == rest.isotropy_errors.max())
+        line = f"surface: isotropy error {isotropy['mean']:.2g} on the mean, {isotropy['worst']:.2g} at {worst}"
     clamped = record["clamped"]
-    yield f"{line}; {clamped} cells are clamped, as a spring would need a stiffness below 0" if clamped else line
+    count = f"{clamped} cells are" if clamped > 1 else "a cell is"
+    yield f"{line}; {count} clamped, as a spring would need a stiffness below 0" if clamped else line
     if not plan.scene.time.at_rest:
         squares = fictitious_masses(plan.material, plan.scene.sheet)
         if plan.material.by_area:

@@ -20,6 +20,9 @@ from taichi_msm.fitting.predict import Prediction, Runs
 # Largest residual with almost full weight in robust fits, in sigma.
 OUTLIER_SIGMAS = 2.0
 
+# Relative changes of the cost and of x, and the gradient, at which a search ends.
+TOLERANCES = {"ftol": 1e-6, "xtol": 1e-8, "gtol": 1e-12}
+
 # Largest coordinate of an alternative start, a factor of 10 from the initial value.
 MAX_START_LOG = np.log(10.0)
 
@@ -202,19 +205,9 @@ class Search:
             assert predicted is not None
             return self.misfit.scaled(self._differences(x, predicted, signs=(1,)), scales)
 
+        loss = {"loss": "soft_l1" if self.misfit.robust else "linear", "f_scale": OUTLIER_SIGMAS}
         with np.errstate(all="ignore"):  # SciPy divides by gradients that are 0.
-            result = least_squares(
-                residuals,
-                start,
-                jacobian,
-                self._limits,
-                ftol=1e-6,
-                xtol=1e-8,
-                gtol=1e-12,
-                loss="soft_l1" if self.misfit.robust else "linear",
-                f_scale=OUTLIER_SIGMAS,
-                max_nfev=40,
-            )
+            result = least_squares(residuals, start, jacobian, self._limits, max_nfev=40, **TOLERANCES, **loss)
         predicted = self._predict(result.x)
         assert predicted is not None
         return Solution(result.x, predicted, scales, float(result.cost), bool(result.status > 0))

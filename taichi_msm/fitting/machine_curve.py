@@ -180,9 +180,8 @@ class CurveRuns(Runs):
         low, high = self.problem.limits
         # A parameter without effect does not move, which shrinks its region to 0.
         region = np.maximum(region, 1e-6)
-        margin = np.array(
-            [CONTACT_MARGIN * self._tangent.reach / (parameter.scale or 1) for parameter in self.problem.parameters]
-        )
+        scales = np.array([parameter.scale or 1 for parameter in self.problem.parameters])
+        margin = CONTACT_MARGIN * self._tangent.reach / scales
         below = np.where(self._is_contact, np.minimum(region, margin), region)
         return np.maximum(low, x - below), np.minimum(high, x + region)
 
@@ -224,11 +223,9 @@ class CurveRuns(Runs):
         # Too large shares are scaled down: an error instead would be a wall that the search cannot leave.
         scale = min(1.0, MAX_SHARES / max(sum(share for share, _ in branches), NO_SHARE))
         branches = [(scale * share, time) for share, time in branches]
-        forces_of_tests = [
-            relax(curve(loading.travel(values.get(key))), branches, 1 / loading.rate)
-            for loading, key in zip(self.problem.tests, self.problem.contact_keys, strict=True)
-        ]
-        return Prediction((np.concatenate(forces_of_tests)[:, None] + self._correction,), 1, np.zeros(1))
+        pairs = zip(self.problem.tests, self.problem.contact_keys, strict=True)
+        of_tests = [relax(curve(test.travel(values.get(key))), branches, 1 / test.rate) for test, key in pairs]
+        return Prediction((np.concatenate(of_tests)[:, None] + self._correction,), 1, np.zeros(1))
 
     def _forces(self, values: dict[str, float], reach: float, halvings: int = 0) -> Array:
         """Return the forces of a curve at equidistant travels [N], shape (TRAVELS + 1,), with a cache."""

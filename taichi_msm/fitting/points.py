@@ -137,9 +137,8 @@ class PointObservation(Observation):
 
     def rest_positions(self, scene: Scene) -> Array:
         """Return the rest positions of the points [m], shape (N, 3)."""
-        height, width = scene.sheet.size
-        across, down = self.coordinates.T
-        return np.stack([(across - 0.5) * width, (0.5 - down) * height, np.zeros_like(across)], axis=1)
+        rest = rest_of(scene.sheet)
+        return rest.place(rest.coordinates(self.coordinates))
 
     def at_rest(self, scene: Scene) -> Array:
         """Return the values of the sheet at rest, shape (N, T, 3 or 2)."""
@@ -160,7 +159,7 @@ class PointObservation(Observation):
             panels.append(partial(plot_match, fitted=x, observed=y, unit=self.unit, origin="the mean"))
         if np.sum(self.is_observed.any(axis=1)) > 1:
             residuals = np.sqrt(np.nanmean((fitted - self.values) ** 2, axis=(1, 2)))
-            on_sheet = partial(plot_on_sheet, coordinates=self.coordinates, size=scene.sheet.size)
+            on_sheet = partial(plot_on_sheet, coordinates=self.coordinates, size=rest_of(scene.sheet).sides)
             panels.append(partial(on_sheet, residuals=residuals, unit=self.unit))
         return panels
 
@@ -311,11 +310,10 @@ class Positions(PointObservation):
                 float(np.linalg.norm(points - points.mean(axis=0), axis=1).max()) for points in (centres, rest[:, :2])
             )
             if rest_extent > 0 and extent > 0 and not 1 / MAX_EXTENT_RATIO < extent / rest_extent < MAX_EXTENT_RATIO:
-                fault = (
-                    f"the points extend {extent:.3g} m from their middle, but {rest_extent:.3g} m at rest; give metres"
-                )
-                unit = {3: ": are they in mm? divide them by 1000", 2: ": are they in cm? divide them by 100"}
-                yield f"{self.subject}: {fault}{unit.get(round(math.log10(extent / rest_extent)), '')}"
+                extents = f"{extent:.3g} m from their middle, but {rest_extent:.3g} m at rest"
+                units = {3: ": are they in mm? divide them by 1000", 2: ": are they in cm? divide them by 100"}
+                unit = units.get(round(math.log10(extent / rest_extent)), "")
+                yield f"{self.subject}: the points extend {extents}; give metres{unit}"
         yield from super().faults(scene)
 
 
@@ -335,12 +333,11 @@ class Pixels(PointObservation):
         return np.stack(pixels, axis=1)
 
     def backward(self, scene: Scene, points: Array, gradient: Array) -> Array:
-        steps = 1e-6 * rest_of(scene.sheet).extent * np.eye(3)
-        changes = (
-            (self.observe(scene, points + step) - self.observe(scene, points - step)) / (2 * step.sum())
-            for step in steps
-        )
-        return np.stack([(gradient * change).sum(axis=-1) for change in changes], axis=-1)
+        by_axis = []
+        for step in 1e-6 * rest_of(scene.sheet).extent * np.eye(3):
+            change = (self.observe(scene, points + step) - self.observe(scene, points - step)) / (2 * step.sum())
+            by_axis.append((gradient * change).sum(axis=-1))
+        return np.stack(by_axis, axis=-1)
 
     def conventions(self, scene: Scene) -> Conventions:
         """Return the conventions of pixels."""

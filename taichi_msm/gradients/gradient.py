@@ -28,12 +28,17 @@ from taichi_msm.terms import build_terms
 Array = NDArray[np.float64]
 
 
+_NUMBERS = "fit numbers instead of a map, or take finite differences"
+
+
 def require_differentiable(plan: Plan) -> None:
-    """Raise a SceneError if a scene has a position-controlled tool or another term without a gradient."""
+    """Raise a SceneError if a scene has a curved sheet, a position-controlled tool or a term without a gradient."""
+    if plan.scene.sheet.surface:
+        reason = "a sheet that is curved at rest has no gradient"
+        raise SceneError([f"sheet.surface: {reason}; {_NUMBERS}"])
     for tool in plan.tools:
         reason = "a tool with a path has no gradient, as its contact begins and ends"
-        remedy = "fit numbers instead of a map, or take finite differences"
-        raise SceneError([f"probes.{tool.probe}.path: {reason}; {remedy}"])
+        raise SceneError([f"probes.{tool.probe}.path: {reason}; {_NUMBERS}"])
     for term in build_terms(plan):
         if not term.has_gradient:
             reason = "has no gradient, which the fit of a map needs; remove it, or fit numbers"
@@ -163,9 +168,7 @@ def gradient(scene: Scene | Mapping[str, Any], loss: Loss, threads: int | None =
         raise ArgumentError(f"loss: its value is {description}; return a finite number")
     slope = as_array(by_position, "slope")
     if not is_real_array(slope, position.shape) or not np.isfinite(slope).all():
-        raise ArgumentError(
-            f"the loss's derivative: {slope.dtype} of shape {slope.shape}; take finite numbers of shape "
-            f"{position.shape}, that of the positions"
-        )
+        remedy = f"take finite numbers of shape {position.shape}, that of the positions"
+        raise ArgumentError(f"the loss's derivative: {slope.dtype} of shape {slope.shape}; {remedy}")
     derivatives = adjoint.backward(np.asarray(slope, float))
     return Gradient(derivatives.numbers, derivatives.maps, float(value))

@@ -67,6 +67,7 @@ FORCE_BYTES = 6 * 8  # values in the checkpoint
 
 # Numbers in memory per mass point.
 STATE_NUMBERS = 6  # displacement and last difference
+CURVED_NUMBERS = 8  # of a curved sheet: mobility, rest position, stiffness of four springs
 MAP_NUMBERS = {"map": 6, "foundation_map": 4}  # stiffness of three springs; factor of the foundation; temporary arrays
 OUTPUT_NUMBERS = 15  # copies at the start and for output
 
@@ -125,6 +126,7 @@ def estimate_budget(plan: Plan) -> Budget:
     force_rows = frames * len(scene.probes)
     memory_numbers = len(memory_names(plan))
     numbers = STATE_NUMBERS + OUTPUT_NUMBERS + memory_numbers + sum(MAP_NUMBERS[name] for name in scene.maps)
+    numbers += CURVED_NUMBERS * (scene.sheet.surface is not None)
     numbers += sum(not probe.moved for probe in scene.probes)  # the load of each force-controlled tool
     # Companion runs add up to two sheets in f64, and with tissue two smaller ones.
     has_companions = scene.time.tolerance is not None or choose_companion_runs(plan).planned

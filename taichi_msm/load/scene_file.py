@@ -101,9 +101,7 @@ def plan_file(file: ParsedFile, overrides: Overrides = (), image: str | Path | N
     if "scene" in draft.data and {"vary", "variables"} & draft.data.keys():
         raise SceneError([f"{file.name}:1:1: a sweep; use `taichi-msm sweep`"])
     parsed = (
-        starmap(_build_override, overrides.items())
-        if isinstance(overrides, Mapping)
-        else map(parse_override, overrides)
+        starmap(_to_override, overrides.items()) if isinstance(overrides, Mapping) else map(parse_override, overrides)
     )
     for override in parsed:
         draft.override(override)
@@ -162,7 +160,7 @@ def parse_override(text: str) -> Override:
     return Override(name, path, document.data, faults)
 
 
-def _build_override(key: str, value: Any) -> Override:
+def _to_override(key: str, value: Any) -> Override:
     path = parse_key(key)
     name = f"override {truncate(key)}"
     if not path:
@@ -224,7 +222,7 @@ class Draft:
         is_overridden = any(key[:n] in self._overridden for n in range(1, len(key) + 1))
         if not is_overridden and not is_below(folder / path, folder):
             remedy = ", or name it with --image" if key == IMAGE_KEY else ""
-            noun = "the picture" if key in PICTURE_KEYS else "it"
+            noun = "the picture" if key in PICTURE_KEYS and key not in SURFACE_KEYS else "it"
             message = f"{path} is not below the scene's folder; put {noun} there{remedy}"
             self.problems.append((self._origin(key), Problem(key, message)))
             del section[key[-1]]

@@ -157,10 +157,8 @@ def _orient(test: MachineTest) -> MachineTest:
     growth = depth[fallen[0]] - depth[peak]
     if growth <= 0 or growth < speed / 2 * (time[fallen[0]] - time[peak]):
         return test
-    note = (
-        f"{test.name}: the force falls by half from {force[peak]:.4g} N at {time[peak]:.4g} s while the depth grows: "
-        f"{TORE}; --window {time[0]:.4g},{time[peak]:.4g} cuts the table there"
-    )
+    fall = f"the force falls by half from {force[peak]:.4g} N at {time[peak]:.4g} s while the depth grows"
+    note = f"{test.name}: {fall}: {TORE}; --window {time[0]:.4g},{time[peak]:.4g} cuts the table there"
     return replace(test, notes=(*test.notes, note))
 
 
@@ -250,11 +248,8 @@ def _named_quantities(title: str) -> frozenset[str]:
     # Without closing brackets, `BRACKETS` takes quadratic time.
     end = max(title.rfind(")"), title.rfind("]")) + 1
     words = WORD.findall((BRACKETS.sub(" ", title[:end]) + title[end:]).casefold())
-    return frozenset(
-        quantity
-        for quantity, ending in ENDINGS.items()
-        if WORDS[quantity] & {*words} or any(word.endswith(ending) for word in words)
-    )
+    by_ending = {quantity for quantity, ending in ENDINGS.items() if any(word.endswith(ending) for word in words)}
+    return frozenset(by_ending | {quantity for quantity, known in WORDS.items() if known & {*words}})
 
 
 def _fold(text: str) -> str:

@@ -27,7 +27,7 @@ from taichi_msm.system.files import read_regular
 
 _DIGESTS, _OVERRIDES = TypeAdapter(dict[str, str]), TypeAdapter(list[str])
 
-RESTORE_PICTURE = "restore the original picture, or run the scene again"
+RESTORE_PICTURE = "restore the original file, or run the scene again"
 
 
 @dataclass(frozen=True)

@@ -50,6 +50,9 @@ F64_WORK = 2.0
 # Additional work of a step per moving control point, for bending, and per position-controlled tool.
 MOVING_LOAD_WORK, BENDING_WORK, CONTACT_WORK = 1.2, 1.0, 0.5
 
+# Additional work of a step of a curved sheet.
+CURVED_WORK = 0.6
+
 # Work of encoding a pixel, and of drawing a sample of a pixel.
 ENCODING_WORK, SAMPLE_WORK = 40.0, 6.0
 
@@ -100,6 +103,7 @@ def affords_companions(plan: Plan, companions: float) -> bool:
 def _stepping_work(plan: Plan) -> float:
     moving, points = sum(slot.moves for slot in plan.slots), plan.scene.sheet.points
     cost = 1 + MOVING_LOAD_WORK * moving + BENDING_WORK * (plan.material.bending > 0) + CONTACT_WORK * len(plan.tools)
+    cost += CURVED_WORK * (plan.scene.sheet.surface is not None)
     steps = float(plan.grid.steps)
     if plan.scene.time.at_rest:
         # Each evaluation is followed by an update of the positions, which takes as long as a step.
