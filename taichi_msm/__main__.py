@@ -8,6 +8,9 @@ import warnings
 
 from taichi_msm.system import process
 
+# Commands and options that write no results by themselves.
+NO_RESULTS = {"check", "schema", "view", "--dry-run", "--help", "--version"}
+
 
 def main() -> int:
     """Run the command line, and return its exit code."""
@@ -22,7 +25,7 @@ def main() -> int:
     # later, in this process and in the encoder.
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     process.open_standard_streams()
-    process.exit_on_signals()
+    process.exit_on_signals("interrupted" if NO_RESULTS & set(sys.argv) else "interrupted; nothing was written")
     if isinstance(sys.stdout, io.TextIOWrapper):
         # A file name may contain bytes that are not text; stderr escapes them by default.
         sys.stdout.reconfigure(errors="backslashreplace")

@@ -21,8 +21,8 @@ def report(stage, done):
     with suppress(OSError):
         os.write(pipe, f"{stage} {done}\\n".encode())
 
-def exit_on_signals(original=process.exit_on_signals):
-    original()
+def exit_on_signals(message, original=process.exit_on_signals):
+    original(message)
     report("heard", 0)
     from taichi_msm.cli import common  # as the program does next
 

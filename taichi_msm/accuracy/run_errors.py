@@ -263,11 +263,11 @@ def run_warnings(
             f"a spring was pressed to {progress.shortest_spring:.2g} of its rest length: below {MIN_SPRING_RATIO} the "
             "sheet folds over itself and small errors grow; press less"
         )
-    damping_ratio = plan.material.drag * grid.step
-    if damping_ratio > 2 and scene.time.damping_difference == "central":
+    damping_ratio, resolved = plan.material.drag * grid.step, scene.time.integrator.resolved_damping
+    if damping_ratio > resolved:
         yield (
             f"the time step is {damping_ratio:.3g} times the time constant of the damping, so velocities change their "
-            f"sign at every step; take a time.step of at most {2 * grid.step / damping_ratio:.2g} s"
+            f"sign at every step; take a time.step of at most {resolved * grid.step / damping_ratio:.2g} s"
         )
 
 

@@ -12,7 +12,7 @@ from itertools import chain, starmap
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from taichi_msm.errors import ArgumentError, Key, Problem, SceneError, truncate
+from taichi_msm.errors import ArgumentError, Key, Problem, SceneError, require_type, truncate
 from taichi_msm.images import PICTURE_SUFFIXES, actual_path, file_sha256, irregular_kind
 from taichi_msm.load.check import validate, value_at
 from taichi_msm.load.yaml_reader import MAX_DEPTH, Document, Mark, UnreadableError, mark_at, read_yaml
@@ -92,6 +92,8 @@ def load_plan(
     """Read and validate a scene file as `load_scene`, and plan the scene for a CPU."""
     if isinstance(path, Mapping):
         raise ArgumentError("path: a mapping; take the path of a scene file, or build Scene(**mapping)")
+    require_type(path, str | Path, "path", "the path of a scene file")
+    require_type(image, str | Path | None, "image", "the path of a picture or None")
     return plan_file(read_file(str(path), SCENE_KIND), overrides, image)
 
 

@@ -133,15 +133,15 @@ class Interruption:
     def _request(self, number: int, _frame: FrameType | None) -> None:
         self.code = 128 + number
         if self._requested:
-            _exit(self.code, b"interrupted twice; ended at once\n")
+            _exit(self.code, "interrupted twice; ended at once")
         self._requested = True
 
 
-def exit_on_signals() -> None:
-    """End the process at once on a signal, for the time before any results exist."""
+def exit_on_signals(message: str) -> None:
+    """End the process at once on a signal, with a message, for the time before any results exist."""
     global _stderr_copy
     _stderr_copy = os.dup(2)
-    _handle_signals(_exit_on_signal)
+    _handle_signals(lambda number, _frame: _exit(128 + number, message))
 
 
 def ignore_signals() -> None:
@@ -157,13 +157,9 @@ def _handle_signals(handler: Callable[[int, FrameType | None], None]) -> None:
             signal.signal(number, handler)
 
 
-def _exit_on_signal(number: int, _frame: FrameType | None) -> None:
-    _exit(128 + number, b"interrupted; nothing was written\n")
-
-
-def _exit(code: int, message: bytes) -> None:
+def _exit(code: int, message: str) -> None:
     with suppress(OSError):  # stderr may be closed
-        os.write(_stderr_copy, message)
+        os.write(_stderr_copy, f"{message}\n".encode())
     os._exit(code)
 
 

@@ -186,6 +186,16 @@ def test_signal_before_the_first_frame_changes_nothing(
     assert (small / "out" / "run.json").read_text() == earlier
 
 
+@pytest.mark.parametrize("command", ["check", "view"])
+def test_interrupted_command_without_results(command: str, small: Path, message: Messages) -> None:
+    with ReportingProcess(command, "small.yaml", stderr=subprocess.PIPE) as process:
+        process.until("heard")
+        process.send_signal(signal.SIGINT)
+        _, error = process.communicate(timeout=60)
+    assert process.returncode == 128 + signal.SIGINT
+    message(error, "interrupted")
+
+
 def test_ignored_signals_stay_ignored() -> None:
     """A shell's background ignores SIGINT, and nohup SIGHUP."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
