@@ -2,18 +2,13 @@
 
 from __future__ import annotations
 
-import io
 import math
-from base64 import b64encode
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
-from itertools import count
-from string import Template
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from PIL import Image
 
 from taichi_msm.accuracy import divergence
 from taichi_msm.accuracy.diagnosis import Diagnosis, diagnose
@@ -36,6 +31,7 @@ from taichi_msm.render.labels import Flow, FrameOutputs, Labels, Sight
 from taichi_msm.render.picking import pick
 from taichi_msm.render.renderer import Array, CameraLike, Renderer, Shot
 from taichi_msm.render.texture import require_texture
+from taichi_msm.runs.player import Player, jpeg_data_url
 from taichi_msm.scene.scene import Scene
 from taichi_msm.scene.section import MAX_MAGNITUDE
 from taichi_msm.scene.tools import Probe
@@ -461,7 +457,7 @@ class Simulation:
         rows, cols = self.scene.sheet.points
         largest = 1000 * self.progress.max_displacement
         caption = f"{self.time:g} s, {rows} × {cols} points, largest displacement so far {largest:.1f} mm"
-        return f'<figure><img alt="" src="{_jpeg_data_url(self.draw())}"><figcaption>{caption}</figcaption></figure>'
+        return f'<figure><img alt="" src="{jpeg_data_url(self.draw())}"><figcaption>{caption}</figcaption></figure>'
 
     def compile(self, pause: Pause = lambda: None) -> None:
         """Compile all kernels now instead of at the first frame.
@@ -562,63 +558,3 @@ class Simulation:
 
     def _replace_plan(self, plan: Plan) -> None:
         self._plan, self.renderer.scene, self._force_recorder = plan, plan.scene, ForceRecorder(plan)
-
-
-_PLAYER_HTML = Template("""\
-<div id="$name">
-  <img alt="frame" style="display: block; max-width: 100%" src="$first">
-  <button type="button">Play</button>
-  <input type="range" min="0" max="$last" value="0" style="vertical-align: middle; width: 20em">
-  <output>0 s</output>
-  <script>
-    (() => {
-      const root = document.getElementById("$name"), frames = $frames, rate = $rate;
-      const [image, button, range, time] = ["img", "button", "input", "output"].map(tag => root.querySelector(tag));
-      const show = () => {
-        image.src = frames[range.value];
-        time.value = (range.value / rate).toFixed(2) + " s";
-      };
-      let timer = null;
-      range.oninput = show;
-      button.onclick = () => {
-        if (timer) {
-          clearInterval(timer);
-          timer = null;
-        } else {
-          timer = setInterval(() => { range.value = (+range.value + 1) % frames.length; show(); }, 1000 / rate);
-        }
-        button.textContent = timer ? "Pause" : "Play";
-      };
-    })();
-  </script>
-</div>""")
-
-_player_numbers = count()
-
-
-class Player:
-    """Playback of pictures, each of shape (height, width, 3), in a notebook, with a button and a slider."""
-
-    def __init__(self, frames: Sequence[NDArray[np.uint8]], rate: float) -> None:
-        self.frames = tuple(frames)
-        if not self.frames:
-            raise ArgumentError("frames: none; take at least one")
-        self.rate = rate
-
-    def _repr_html_(self) -> str:
-        sources = [_jpeg_data_url(frame) for frame in self.frames]
-        return _PLAYER_HTML.substitute(
-            name=f"taichi-msm-{next(_player_numbers)}",
-            first=sources[0],
-            last=len(sources) - 1,
-            frames=sources,
-            rate=f"{self.rate:g}",
-        )
-
-
-def _jpeg_data_url(picture: NDArray[np.uint8]) -> str:
-    """Encode a picture, shape (height, width, 3), as a data URL with a JPEG."""
-    file = io.BytesIO()
-    # At this quality, artefacts are invisible, and hundreds of frames fit into a notebook.
-    Image.fromarray(picture).save(file, "JPEG", quality=92)
-    return f"data:image/jpeg;base64,{b64encode(file.getvalue()).decode()}"
