@@ -13,8 +13,8 @@ import pytest
 from taichi_msm.errors import ArgumentError, SceneError
 from taichi_msm.fitting.fit import fit
 from taichi_msm.load.scene_file import load_scene
-from taichi_msm.runs.run import resume, run
 from taichi_msm.runs.player import Player
+from taichi_msm.runs.run import resume, run
 from taichi_msm.runs.simulation import Simulation
 from taichi_msm.sweeps.spec import load_sweep
 from taichi_msm.sweeps.sweep import sweep

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -143,20 +144,11 @@ def check(scene: str, image: str | None, overrides: tuple[str, ...], as_json: bo
         cost.require_disk(plan, Path("output"))
         if plan.scene.draws:
             load_texture(plan.scene)
-    loaded, grid, stable_step = plan.scene, plan.grid, plan.stable_step
-    steps = {
-        "step": grid.step,
-        "stable_step": stable_step if stable_step < float("inf") else None,
-        "steps_per_frame": grid.steps_per_frame,
-        "precision": grid.precision,
-        "steps": grid.steps,
-    }
-    if loaded.time.at_rest:
-        steps |= dict.fromkeys(("step", "stable_step", "steps_per_frame", "steps"))
+    loaded, grid = plan.scene, plan.grid
     budget, duration = cost.estimate_budget(plan), cost.estimate_duration(plan)
     report: dict[str, Any] = {
         "scene": loaded.model_dump(mode="json"),
-        **steps,
+        **cost.step_entries(plan, grid.frames),
         "frames": budget.frames,
         "estimated_seconds": duration.seconds,
         "memory": budget.memory_bytes,
@@ -178,11 +170,11 @@ def check(scene: str, image: str | None, overrides: tuple[str, ...], as_json: bo
     stepping = (
         f"each at rest{more}, in {grid.precision}"
         if loaded.time.at_rest
-        else f"{budget.steps} steps of {grid.step:.6g} s (limit {stable_step:.6g} s{_lock_cost(plan)}), "
+        else f"{grid.steps} steps of {grid.step:.6g} s (limit {plan.stable_step:.6g} s{_lock_cost(plan)}), "
         f"{grid.steps_per_frame} a frame{more}, in {grid.precision}"
     )
     click.echo(
-        f"\n{budget.points} points, {budget.frames} frames, {stepping}\n"
+        f"\n{math.prod(loaded.sheet.points)} points, {budget.frames} frames, {stepping}\n"
         f"about {cost.format_rough_time(duration.seconds)} to run{longer} (estimated from its work)\n"
         f"about {budget.memory_bytes / 2**20:.0f} MiB of memory, at most {budget.disk_bytes / 2**20:.1f} MiB on disk, "
         f"{budget.working_bytes / 2**20:.1f} MiB more while it runs"

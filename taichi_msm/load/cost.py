@@ -15,7 +15,7 @@ from contextlib import suppress
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -73,8 +73,6 @@ OUTPUT_NUMBERS = 15  # copies at the start and for output
 class Budget:
     """Memory and disk space of a run."""
 
-    points: int  # number of mass points
-    steps: int  # number of time steps
     frames: int  # including the initial one
     simulation_bytes: int  # memory for the state of the sheet and its output
     drawing_bytes: int  # memory for a frame and the texture; 0 if nothing is drawn
@@ -94,6 +92,19 @@ class Budget:
     def disk_bytes(self) -> int:
         """Upper bound of the size of all results, without `working_bytes`."""
         return self.picture_bytes + self.track_bytes + self.trajectory_bytes + self.force_bytes + self.record_bytes
+
+
+def step_entries(plan: Plan, frames: int) -> dict[str, Any]:
+    """Build the entries of run.json about the steps to a frame; only the precision in a quasi-static scene."""
+    grid, limit = plan.grid, plan.stable_step
+    entries = {
+        "step": grid.step,
+        "stable_step": limit if limit < math.inf else None,
+        "steps_per_frame": grid.steps_per_frame,
+        "precision": grid.precision,
+        "steps": frames * grid.steps_per_frame,
+    }
+    return {**dict.fromkeys(entries), "precision": grid.precision} if plan.scene.time.at_rest else entries
 
 
 def estimate_budget(plan: Plan) -> Budget:
@@ -116,8 +127,6 @@ def estimate_budget(plan: Plan) -> Budget:
     has_companions = scene.time.tolerance is not None or choose_companion_runs(plan).planned
     bytes_per_number = number_bytes + (8 * (2 + (scene.tissue is not None) * 5 / 16) if has_companions else 0)
     return Budget(
-        points=points,
-        steps=grid.steps,
         frames=frames,
         simulation_bytes=round(points * bytes_per_number * numbers),
         drawing_bytes=drawing_bytes(scene) if scene.renders else 0,

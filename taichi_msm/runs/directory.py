@@ -28,7 +28,7 @@ import shutil
 import stat
 import sys
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
-from contextlib import ExitStack, contextmanager, suppress
+from contextlib import AbstractContextManager, ExitStack, contextmanager, suppress
 from pathlib import Path
 from typing import Any, BinaryIO, NamedTuple
 
@@ -64,7 +64,7 @@ class PublicationSpec(NamedTuple):
     unpublished: tuple[str, Collection[str]] | None = None
 
 
-class Publication:
+class Publication(AbstractContextManager["Publication"]):
     """Publication of new files in a directory: a context manager that discards them at exit, except after `publish`.
 
     `names` are all files that may be published. Another process that publishes to the directory, and a foreign file at
@@ -113,9 +113,6 @@ class Publication:
         self._require_free(names, self._listed_results(self._record))
         self.new_folder.replace(self.staging_folder / READY_FOLDER)
         self._complete()
-
-    def __enter__(self) -> Publication:
-        return self
 
     def __exit__(self, *_: object) -> None:
         # Errors are ignored: the next publication repeats the cleanup, and an exception of the block has precedence.

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from contextlib import AbstractContextManager
 from functools import cache, partial
 from pathlib import Path
 
@@ -16,7 +17,7 @@ from taichi_msm.runs.simulation import Simulation
 from taichi_msm.scene.scene import Scene
 
 
-class Playback:
+class Playback(AbstractContextManager["Playback"]):
     """Frames of a finished run. As a context manager, it frees its memory at exit.
 
     Args:
@@ -114,9 +115,6 @@ class Playback:
     def close(self) -> None:
         """Free the memory."""
         self._simulation.close()
-
-    def __enter__(self) -> Playback:
-        return self
 
     def __exit__(self, *_: object) -> None:
         self.close()

@@ -46,7 +46,6 @@ from taichi_msm.runs.simulation import Simulation
 from taichi_msm.runs.writer import ResultWriter, RunRecord
 from taichi_msm.scene.scene import Scene
 from taichi_msm.solver.planning import ENCODING_WORK
-from taichi_msm.solver.state import RunProgress
 from taichi_msm.system import process, runtime
 from taichi_msm.system.compiler import versions
 from taichi_msm.system.runtime import Device
@@ -153,13 +152,11 @@ def run(
     manifest = Manifest(
         given, plan.scene, tuple(overrides), estimate, mesh, estimate_error, current_folder, arch, sha256, versions()
     )
-    context = _RunContext(manifest, plan, texture, device, folder)
+    context = _RunContext(manifest, plan, texture, device, folder, stopwatch, progress)
     if unfinished := _find_unfinished(context):
         with suppress(DamagedError):  # a damaged run starts again
-            return _execute(
-                context._replace(manifest=_add_current_versions(unfinished)), stopwatch, progress, resumes=True
-            )
-    return _execute(context, stopwatch, progress, resumes=False)
+            return _execute(context._replace(manifest=_add_current_versions(unfinished)), resumes=True)
+    return _execute(context, resumes=False)
 
 
 def resume(
@@ -197,8 +194,8 @@ def resume(
     manifest.require_same_inputs(input_digests(plan), versions())
     texture = load_texture(plan.scene, manifest.sha256.get("image")) if plan.scene.draws else None
     device = runtime.start(manifest.arch, threads)
-    context = _RunContext(_add_current_versions(manifest), plan, texture, device, Path(directory))
-    return _execute(context, stopwatch, progress, resumes=True)
+    manifest = _add_current_versions(manifest)
+    return _execute(_RunContext(manifest, plan, texture, device, Path(directory), stopwatch, progress), resumes=True)
 
 
 def _require_callbacks(started: float | None, progress: StageProgressCallback) -> None:
@@ -224,23 +221,23 @@ def _add_current_versions(manifest: Manifest) -> Manifest:
 
 
 class _RunContext(NamedTuple):
-    """Inputs, device and destination of a run."""
+    """Inputs, device and destination of a run, and the observers of its stages."""
 
     manifest: Manifest  # inputs on which the results depend
     plan: Plan  # of the manifest's resolved scene
     texture: NDArray[np.uint8] | None  # the picture on the sheet, if the scene is drawn
     device: Device
     directory: Path  # destination of the results
+    stopwatch: Stopwatch
+    progress: StageProgressCallback
 
 
-def _execute(
-    context: _RunContext, stopwatch: Stopwatch, progress: StageProgressCallback, *, resumes: bool
-) -> RunRecord:
+def _execute(context: _RunContext, *, resumes: bool) -> RunRecord:
     """Simulate, draw and publish all frames; with `resumes`, only those missing in the directory."""
     with ExitStack() as opened:
-        run = _Run(context, stopwatch, progress, opened, resumes=resumes)
+        run = _Run(context, opened, resumes=resumes)
         run.verify_stored_frames()
-        with stopwatch.stage("write"):
+        with context.stopwatch.stage("write"):
             try:
                 run.prepare()
                 run.simulate_frames()
@@ -255,28 +252,15 @@ def _execute(
 class _Run:
     """Run in progress: the simulation, its companion runs and the writer of the results."""
 
-    def __init__(
-        self,
-        context: _RunContext,
-        stopwatch: Stopwatch,
-        progress: StageProgressCallback,
-        opened: ExitStack,
-        *,
-        resumes: bool,
-    ) -> None:
-        self._context, self._stopwatch, self._progress = context, stopwatch, progress
+    def __init__(self, context: _RunContext, opened: ExitStack, *, resumes: bool) -> None:
+        self._context, self._stopwatch, self._progress = context, context.stopwatch, context.progress
         plan, device, manifest = context.plan, context.device, context.manifest
         self._frames = plan.grid.frames + 1
-        progress("compile", 0, self._frames)
+        self._progress("compile", 0, self._frames)
         self._cores = cores = free_cores(plan)
-        # The writer is created first, so that its encoder starts while kernels are compiled. With one thread, no core
-        # is free for the encoder.
-        in_subprocess = device.threads > 1
-        self._writer = opened.enter_context(
-            ResultWriter(
-                context.directory, plan, manifest.as_json(), resumes=resumes, encode_in_subprocess=in_subprocess
-            )
-        )
+        # The writer is created first, so that its encoder starts while kernels are compiled.
+        writer = ResultWriter(context.directory, plan, manifest.as_json(), resumes=resumes, threads=device.threads)
+        self._writer = opened.enter_context(writer)
         self._simulation = opened.enter_context(Simulation(plan, device.arch, device.threads, context.texture, cores))
         self._resumed_frames = self._writer.stored_frames
         companions = _choose_companions(context, resumed=self._resumed_frames > 0)
@@ -438,7 +422,8 @@ class _Run:
             "sha256": dict(manifest.sha256),
             "overrides": list(manifest.overrides),
             "points": list(scene.sheet.points),
-            **_step_entries(plan, progress),
+            **cost.step_entries(plan, progress.frame),
+            **({"residual": progress.residual, "evaluations": progress.evaluations} if scene.time.at_rest else {}),
             "max_displacement": progress.max_displacement,
             "max_displacement_frame": progress.max_displacement_frame,
             "shortest_spring": progress.shortest_spring,
@@ -474,22 +459,6 @@ def _runs_within_an_hour(plan: Plan) -> bool:
     return cost.estimate_duration(plan).seconds <= 3600
 
 
-def _step_entries(plan: Plan, progress: RunProgress) -> dict[str, Any]:
-    """Build the entries about the time steps, or for a quasi-static scene about the residual."""
-    grid, limit = plan.grid, plan.stable_step
-    if plan.scene.time.at_rest:
-        steps = dict.fromkeys(("step", "stable_step", "steps_per_frame", "steps"))
-        residual = {"residual": progress.residual, "evaluations": progress.evaluations}
-        return {**steps, "precision": grid.precision, **residual}
-    return {
-        "step": grid.step,
-        "stable_step": limit if limit < math.inf else None,
-        "steps_per_frame": grid.steps_per_frame,
-        "precision": grid.precision,
-        "steps": progress.frame * grid.steps_per_frame,
-    }
-
-
 def free_cores(plan: Plan) -> int:
     """Return the number of cores for stepping: all, or one less if encoding takes longer than stepping."""
     width, height = plan.scene.render.size
@@ -502,8 +471,8 @@ def free_cores(plan: Plan) -> int:
 def _requested_values(given: Scene, scene: Scene) -> dict[str, Any]:
     """Return the requested values that differ from the resolved ones, by dotted key."""
     keys = ("sheet.points", "sheet.tolerance", "time.step", "time.precision", "time.tolerance")
-    pairs = [(key, attrgetter(key)(given), attrgetter(key)(scene)) for key in keys]
-    return {key: requested for key, requested, resolved in pairs if requested != resolved}
+    values = zip(keys, attrgetter(*keys)(given), attrgetter(*keys)(scene), strict=True)
+    return {key: requested for key, requested, resolved in values if requested != resolved}
 
 
 def _pixels_per_metre(scene: Scene) -> float | None:

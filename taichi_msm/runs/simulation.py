@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import AbstractContextManager
 from dataclasses import replace
 from typing import Any
 
@@ -45,7 +46,7 @@ from taichi_msm.system import runtime
 _compiled_kernels: set[tuple[object, ...]] = set()
 
 
-class Simulation:
+class Simulation(AbstractContextManager["Simulation"]):
     """Simulation of a scene, frame by frame. As a context manager, it frees its memory at exit.
 
     Args:
@@ -178,8 +179,7 @@ class Simulation:
             SceneError: when an entry is not a valid probe, or a tool would jump.
         """
         self._require_open()
-        if not isinstance(probes, Sequence):
-            raise ArgumentError(f"probes: {probes!r}; take a list of them")
+        require_type(probes, Sequence, "probes", "a list of them")
         self._solve_first_frame()
         plan = steer_plan(self._plan, probes, self._plan.grid.time(self.steps))
         self._dynamics.steer(plan)
@@ -482,9 +482,6 @@ class Simulation:
         self._dynamics.close()
         self.renderer.close()
 
-    def __enter__(self) -> Simulation:
-        return self
-
     def __exit__(self, *_: object) -> None:
         self.close()
 
@@ -524,14 +521,11 @@ class Simulation:
     def _shot(self, camera: CameraLike, positions: Array | None, time: float | None) -> Shot:
         """Validate positions and time, place the instruments, and set up the camera."""
         self._require_open()
-        if positions is None:
-            positions = self.positions()
-        else:
-            positions, shape = as_array(positions, "positions"), self.positions().shape
-            if not is_real_array(positions, shape):
-                raise ArgumentError(
-                    f"positions: {positions.dtype} of shape {positions.shape}; take numbers of shape {shape}"
-                )
+        current = self.positions()
+        positions = current if positions is None else as_array(positions, "positions")
+        if not is_real_array(positions, current.shape):
+            fault = f"positions: {positions.dtype} of shape {positions.shape}"
+            raise ArgumentError(f"{fault}; take numbers of shape {current.shape}")
         # Beyond it, kernels overflow. The minimum is NaN if any value is.
         if not (positions.min() >= -MAX_MAGNITUDE and positions.max() <= MAX_MAGNITUDE):
             place = tuple(np.argwhere(~(np.abs(positions) <= MAX_MAGNITUDE))[0].tolist())
@@ -542,18 +536,15 @@ class Simulation:
             time = self.time
         elif not (is_real_array(as_array(time, "time"), ()) and math.isfinite(time)):
             raise ArgumentError(f"time: {time!r}; take a number, in seconds, or None for now")
-        return Shot(
-            positions, self.renderer.resolve_camera(camera, time), place_instruments(self.scene, positions, time)
-        )
+        instruments = place_instruments(self.scene, positions, time)
+        return Shot(positions, self.renderer.resolve_camera(camera, time), instruments)
 
     def _require_no_fault(self, reading: Reading, fault: str) -> None:
         """Raise a DivergedError if `fault` is not empty."""
         if fault:
             steps, time = reading.steps, self._plan.grid.time(reading.steps)
-            point = largest_displacement(reading.displacement)[:2]
-            self._divergence = DivergedError(
-                divergence.format_message(time, steps, fault, exact=False), steps, time, point
-            )
+            message = divergence.format_message(time, steps, fault, exact=False)
+            self._divergence = DivergedError(message, steps, time, largest_displacement(reading.displacement)[:2])
             raise self._divergence
 
     def _replace_plan(self, plan: Plan) -> None:

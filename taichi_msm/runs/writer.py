@@ -6,7 +6,7 @@ import csv
 import io
 import json
 from collections.abc import Callable, Mapping, Sequence
-from contextlib import ExitStack
+from contextlib import AbstractContextManager, ExitStack
 from functools import partial
 from pathlib import Path
 from typing import Any, BinaryIO, Literal, TypedDict
@@ -40,13 +40,14 @@ RUN_PUBLICATION = PublicationSpec(
 )
 
 
-class ResultWriter:
+class ResultWriter(AbstractContextManager["ResultWriter"]):
     """Streaming writer of the results of a run, as a context manager.
 
     Files are written to a hidden folder, and `publish` moves them into place atomically. Without `publish`, they are
     deleted at exit. With a manifest, a checkpoint exists from the first frame to the publication of complete results,
-    and a later writer `resumes` from it. Without a subprocess, `add` encodes the pictures. Foreign files in the
-    directory are never changed; one at the path of a result is a FilesError, as is another run that writes there.
+    and a later writer `resumes` from it. With one of `threads`, no core is free for an encoding process, and `add`
+    encodes the pictures. Foreign files in the directory are never changed; one at the path of a result is a FilesError,
+    as is another run that writes there.
     """
 
     def __init__(
@@ -56,7 +57,7 @@ class ResultWriter:
         manifest: Mapping[str, Any] | None = None,
         *,
         resumes: bool = False,
-        encode_in_subprocess: bool = True,
+        threads: int = 2,
     ) -> None:
         self._directory, self._manifest = directory, manifest
         self._scene = scene = plan.scene
@@ -75,7 +76,7 @@ class ResultWriter:
                 render, rate = scene.render, scene.time.frames_per_second
                 job = EncodingJob(folders, render.size, rate, scene.output, render.background, render.quality)
                 locks = self._publication.lock_descriptors
-                self._encoder = Encoder(job, locks) if encode_in_subprocess else PictureWriter(job)
+                self._encoder = Encoder(job, locks) if threads > 1 else PictureWriter(job)
                 opened.callback(self._encoder.abort)
             self._checkpoint = Checkpoint(self._publication.staging_folder / CHECKPOINT_FOLDER, plan)
             opened.callback(self._checkpoint.close)
@@ -191,9 +192,6 @@ class ResultWriter:
                 time = frame / self._scene.time.frames_per_second
                 forces = self._checkpoint.read_forces(frame)
                 rows.writerows((time, force.probe, *force.tip, *force.force) for force in forces)
-
-    def __enter__(self) -> ResultWriter:
-        return self
 
     def __exit__(self, *_: object) -> None:
         self._open.close()

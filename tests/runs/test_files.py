@@ -78,7 +78,7 @@ def observed(frame: int) -> dict[str, FrameOutputs]:
 
 
 def write(directory: Path, frames: int, scene: Scene, *, in_subprocess: bool = True) -> list[str]:
-    with ResultWriter(directory, plan_of(scene), encode_in_subprocess=in_subprocess) as writer:
+    with ResultWriter(directory, plan_of(scene), threads=1 + in_subprocess) as writer:
         for frame in range(frames):
             writer.add(position(frame), observed(frame) if scene.draws else {"": FrameOutputs()})
         names: list[str] = writer.publish({})["outputs"]
@@ -161,7 +161,7 @@ def test_unpublished_results_are_discarded(in_subprocess: bool, tmp_path: Path) 
     write(tmp_path / "out", 3, small_scene())
     before = files(tmp_path / "out")
     for directory in (tmp_path / "out", tmp_path / "fresh"):
-        with ResultWriter(directory, plan_of(small_scene()), encode_in_subprocess=in_subprocess) as writer:
+        with ResultWriter(directory, plan_of(small_scene()), threads=1 + in_subprocess) as writer:
             writer.add(position(9), {"": FrameOutputs(picture(9))})
     assert files(tmp_path / "out") == before
     assert not (tmp_path / "fresh").exists()
@@ -203,7 +203,7 @@ def test_interruption_during_encoding_in_threads(
         time.sleep(0.3)  # until the main thread is interrupted
         return original(*arguments, **keywords)
 
-    with ResultWriter(tmp_path / "interrupted", plan_of(small_scene()), encode_in_subprocess=False) as writer:
+    with ResultWriter(tmp_path / "interrupted", plan_of(small_scene()), threads=1) as writer:
         writer.add(position(0), {"": FrameOutputs(picture(0))})
         with monkeypatch.context() as patch:
             patch.setattr(owner, part, interrupted)
@@ -225,7 +225,7 @@ def test_interruption_between_still_and_film(tmp_path: Path, monkeypatch: pytest
         return write_still(*arguments)
 
     write_still = encoder._write_still
-    with ResultWriter(tmp_path / "interrupted", plan_of(small_scene()), encode_in_subprocess=False) as writer:
+    with ResultWriter(tmp_path / "interrupted", plan_of(small_scene()), threads=1) as writer:
         writer.add(position(0), observed(0))
         assert isinstance(writer._encoder, PictureWriter)
         with monkeypatch.context() as patch:
@@ -294,7 +294,7 @@ def file_error(
     """Error message of a run that an event interrupts."""
 
     def run() -> None:
-        with ResultWriter(directory, plan_of(small_scene()), encode_in_subprocess=in_subprocess) as writer:
+        with ResultWriter(directory, plan_of(small_scene()), threads=1 + in_subprocess) as writer:
             meanwhile(writer)
             for frame in range(1000):
                 writer.add(position(frame), {"": FrameOutputs(picture(frame))})
