@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import json
 import shlex
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
 import click
 
-from taichi_msm.errors import FilesError, SceneError
+from taichi_msm.errors import FilesError, SceneError, printable
 from taichi_msm.runs.directory import require_no_link
 from taichi_msm.system.process import Interruption, write_stderr
 
@@ -110,6 +110,14 @@ def interruptible(
 def print_json(value: Any) -> None:
     """Print a JSON object on stdout."""
     click.echo(json.dumps(value, indent=2, allow_nan=False))
+
+
+def print_result(as_json: bool, record: Mapping[str, Any], lines: Iterable[str], quiet: bool = False) -> None:
+    """Print a result on stdout: a JSON object, or lines with any characters, unless `quiet`."""
+    if as_json:
+        print_json(record)
+    elif not quiet:
+        click.echo("\n".join(map(printable, lines)))
 
 
 def report_failure(status: str, lines: Sequence[str], as_json: bool) -> None:

@@ -13,6 +13,7 @@ import click
 
 from taichi_msm.cli import options
 from taichi_msm.errors import FilesError, did_you_mean, printable, writing
+from taichi_msm.runs.directory import replacing
 
 
 @options.program.command()
@@ -32,13 +33,8 @@ def example(name: str | None, directory: str) -> None:
     for path, target in targets.items():
         _require_free(path, target, is_scene=path == scenes[name])
     for path, target in targets.items():
-        with writing(target, "DIR"):
-            target.parent.mkdir(parents=True, exist_ok=True)
-            try:
-                target.write_bytes(path.read_bytes())
-            except OSError:
-                target.unlink(missing_ok=True)
-                raise
+        with writing(target, "DIR"), replacing(target) as file:
+            file.write(path.read_bytes())
         click.echo(printable(str(target)))
     command = "sweep" if "vary" in _content(scenes[name]) else "run"
     click.echo(printable(f"next: taichi-msm {command} {shlex.quote(str(targets[scenes[name]]))}"))

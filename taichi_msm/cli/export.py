@@ -7,7 +7,6 @@ from functools import partial
 import click
 
 from taichi_msm.cli import common, options
-from taichi_msm.errors import printable
 from taichi_msm.exports.formats import FORMATS
 
 
@@ -21,13 +20,9 @@ from taichi_msm.exports.formats import FORMATS
     required=True,
     help="; ".join(f"{name}: {row.description}" for name, row in FORMATS.items()) + ".",
 )
-@click.option(
-    "--out",
-    metavar="DIR2",
-    help="Directory for the files.  [default: DIR/export-FORMAT; of several DIR, output/export-FORMAT]",
-)
+@options.out_option("Directory for the files.", "DIR/export-FORMAT; of several DIR, output/export-FORMAT", "DIR2")
 @click.option("--camera", metavar="NAME", help="Camera whose files are exported, of runs with several cameras.")
-@click.option("--quiet", is_flag=True, help="Print no progress and no summary.")
+@options.quiet_option
 @options.json_option
 def export(
     directories: tuple[str, ...], name: str, out: str | None, camera: str | None, quiet: bool, as_json: bool
@@ -40,12 +35,6 @@ def export(
 
     with common.interruptible(as_json, quiet) as progress:
         exported = export_module.export(runs, name, folder, partial(progress, "export"), camera)
-    if as_json:
-        common.print_json(
-            {"directory": str(exported.directory), "format": name, "files": exported.files, "notes": exported.notes}
-        )
-    elif not quiet:
-        files = ", ".join(exported.files) if len(exported.files) <= 2 else f"{len(exported.files)} files"
-        click.echo(printable(f"{exported.directory}: {files}"))
-        for note in exported.notes:
-            click.echo(printable(note))
+    record = {"directory": str(exported.directory), "format": name, "files": exported.files, "notes": exported.notes}
+    files = ", ".join(exported.files) if len(exported.files) <= 2 else f"{len(exported.files)} files"
+    common.print_result(as_json, record, [f"{exported.directory}: {files}", *exported.notes], quiet)

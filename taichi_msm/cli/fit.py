@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
 import click
 
 from taichi_msm.cli import common, options
-from taichi_msm.errors import DivergedError, printable
+from taichi_msm.errors import DivergedError
 
 
 @options.program.command()
@@ -45,7 +47,7 @@ from taichi_msm.errors import DivergedError, printable
     multiple=True,
     help="Of tables: depth at contact [m], one for all or each.",
 )
-@click.option("--out", metavar="DIR", help="Directory for the fit.  [default: output/<name of the scene file>-fit]")
+@options.out_option("Directory for the fit.", "output/<name of the scene file>-fit")
 @options.workers_option(help="Number of worker processes.  [default: chosen by the duration of the first run]")
 @options.json_option
 def fit(
@@ -98,38 +100,37 @@ def fit(
     except DivergedError as error:
         common.report_failure("diverged", [f"{scene}: at the initial values of the search: {error}"], as_json)
         return common.DIVERGED
-    if as_json:
-        common.print_json({"directory": str(directory), **result.as_json()})
-    else:
-        click.echo("\n".join(map(printable, [f"{directory}: fit of {', '.join(tables)}", *result.summary()])))
+    lines = [f"{directory}: fit of {', '.join(tables)}", *result.summary()]
+    common.print_result(as_json, {"directory": str(directory), **result.as_json()}, lines)
     return common.DONE
 
 
 def parse_bounds(text: str) -> tuple[str, tuple[float, float]]:
     """Parse KEY=LOW,HIGH, where a missing bound is infinite."""
-    try:
+    with _expecting("KEY=LOW,HIGH, such as tissue.young=5e3,1e5", text, "--bounds"):
         key, interval = text.split("=", 1)
         low, high = interval.split(",", 1)
         return key.strip(), (float(low or "-inf"), float(high or "inf"))
-    except ValueError:
-        message = f"{text}: expected KEY=LOW,HIGH, such as tissue.young=5e3,1e5"
-        raise click.BadParameter(message, param_hint="--bounds") from None
 
 
 def parse_forces(text: str) -> tuple[str, float]:
     """Parse FILE,SIGMA."""
-    try:
+    with _expecting("FILE,SIGMA, such as forces.csv,0.01", text, "--forces"):
         name, sigma = text.rsplit(",", 1)
         return name, float(sigma)
-    except ValueError:
-        message = f"{text}: expected FILE,SIGMA, such as forces.csv,0.01"
-        raise click.BadParameter(message, param_hint="--forces") from None
 
 
 def parse_window(text: str) -> tuple[float, float]:
     """Parse T0,T1."""
-    try:
+    with _expecting("T0,T1, such as 0.5,12", text, "--window"):
         first, last = text.split(",", 1)
         return float(first), float(last)
+
+
+@contextmanager
+def _expecting(expected: str, text: str, option: str) -> Iterator[None]:
+    """Convert a ValueError of the block to a BadParameter of an option with this text."""
+    try:
+        yield
     except ValueError:
-        raise click.BadParameter(f"{text}: expected T0,T1, such as 0.5,12", param_hint="--window") from None
+        raise click.BadParameter(f"{text}: expected {expected}", param_hint=option) from None

@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Callable
 from functools import partial
-from typing import Any
+from typing import Any, TypeVar
 
 import click
 
 from taichi_msm.errors import MAX_WORKERS, did_you_mean
 from taichi_msm.version import __version__
+
+Command = TypeVar("Command", bound=Callable[..., Any])
 
 
 class SuggestingChoice(click.Choice):  # type: ignore[type-arg]  # not generic before click 8.2
@@ -33,6 +36,21 @@ def parse_shard(text: str) -> tuple[int, int]:
 
 
 scene_argument = click.argument("scene", metavar="SCENE")
+
+
+def out_option(help: str, default: str, metavar: str = "DIR") -> Callable[[Command], Command]:  # noqa: A002
+    """Return the option of the directory of results."""
+    return click.option("--out", metavar=metavar, help=f"{help}  [default: {default}]")
+
+
+def device_options(command: Command) -> Command:
+    """Add the options of the picture and the keys of a scene, and of the device."""
+    for option in (threads_option, arch_option, set_option, image_option):
+        command = option(command)
+    return command
+
+
+quiet_option = click.option("--quiet", is_flag=True, help="Print no progress and no summary.")
 image_option = click.option("--image", metavar="FILE", help="Picture on the sheet, instead of the scene's.")
 quality_option = click.option(
     "--quality", type=click.IntRange(1, 100), metavar="N", help="Quality of the MP4 film [%].  [default: 65]"

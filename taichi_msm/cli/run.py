@@ -19,15 +19,8 @@ if TYPE_CHECKING:
 
 @options.program.command()
 @click.argument("scene", metavar="SCENE", required=False)
-@click.option(
-    "--out",
-    metavar="DIR",
-    help="Directory for the results.  [default: output/<name of the scene file>; with --again, its DIR]",
-)
-@options.image_option
-@options.set_option
-@options.arch_option
-@options.threads_option
+@options.out_option("Directory for the results.", "output/<name of the scene file>; with --again, its DIR")
+@options.device_options
 @click.option(
     "--estimate-error/--no-estimate",
     default=None,
@@ -36,7 +29,7 @@ if TYPE_CHECKING:
 @options.quality_option
 @click.option("--resume", metavar="DIR", help="Continue the unfinished run in DIR instead of running SCENE.")
 @click.option("--again", metavar="DIR", help="Repeat the run of DIR/run.json instead of running SCENE.")
-@click.option("--quiet", is_flag=True, help="Print no progress and no summary.")
+@options.quiet_option
 @options.json_option
 @click.pass_context
 def run(
@@ -45,14 +38,13 @@ def run(
     out: str | None,
     image: str | None,
     overrides: tuple[str, ...],
-    arch: str,
     threads: int | None,
-    estimate_error: bool | None,
     quality: int | None,
     resume: str | None,
     again: str | None,
     quiet: bool,
     as_json: bool,
+    **settings: Any,
 ) -> int:
     """Simulate SCENE, draw its frames and write them."""
     overrides += () if quality is None else (f"render.quality={quality}",)
@@ -95,16 +87,8 @@ def run(
         if resume is not None:
             record = run_module.resume(directory, threads=threads, started=START_TIME, progress=progress)
         else:
-            record = run_module.run(
-                plan,
-                directory,
-                arch=arch,
-                threads=threads,
-                overrides=recorded,
-                estimate_error=estimate_error,
-                started=START_TIME,
-                progress=progress,
-            )
+            settings |= {"threads": threads, "overrides": recorded, "started": START_TIME, "progress": progress}
+            record = run_module.run(plan, directory, **settings)
     if as_json:
         common.print_json({"directory": str(directory), **record})
     if record["status"] != "complete":

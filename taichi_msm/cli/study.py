@@ -21,13 +21,8 @@ if TYPE_CHECKING:
 
 @options.program.command()
 @options.scene_argument
-@click.option(
-    "--out", metavar="DIR", help="Directory for the report.  [default: output/<name of the scene file>-study]"
-)
-@options.image_option
-@options.set_option
-@options.arch_option
-@options.threads_option
+@options.out_option("Directory for the report.", "output/<name of the scene file>-study")
+@options.device_options
 @click.option(
     "--tolerance",
     type=float,
@@ -68,25 +63,15 @@ def study(
         # An interrupted study must not replace a complete one.
         directory = require_no_link(directory / "interrupted", "--out")
     outputs = write_report(results, directory)
-    if as_json:
-        common.print_json({"directory": str(directory), **study_record(results), "outputs": outputs})
-    else:
-        click.echo(format_summary(results))
-        click.echo(printable(f"{directory}: {', '.join(outputs)}"))
+    lines = [*format_summary(results).splitlines(), f"{directory}: {', '.join(outputs)}"]
+    common.print_result(as_json, {"directory": str(directory), **study_record(results), "outputs": outputs}, lines)
     return common.EXIT_CODES.get(results.status, interruption.code)
 
 
 @options.program.command()
 @options.scene_argument
-@click.option(
-    "--out",
-    metavar="DIR",
-    help="Directory for saved images, films and scenes.  [default: output/<name of the scene file>-live]",
-)
-@options.image_option
-@options.set_option
-@options.arch_option
-@options.threads_option
+@options.out_option("Directory for saved images, films and scenes.", "output/<name of the scene file>-live")
+@options.device_options
 @click.option("--play", is_flag=True, help="Let the scene's own probes act, too.")
 @click.option(
     "--browser", is_flag=True, expose_value=False, help="Show the session on a page in a browser, the default."
@@ -110,14 +95,12 @@ def view(
     out: str | None,
     image: str | None,
     overrides: tuple[str, ...],
-    arch: str,
-    threads: int | None,
-    play: bool,
     port: int,
     origins: tuple[str, ...],
     record: str | None,
     seconds: float | None,
     script: str | None,
+    **settings: Any,
 ) -> int:
     """Press the tissue of SCENE with the mouse or a finger, on a page in a browser."""
     from taichi_msm.load.scene_file import load_scene
@@ -150,7 +133,7 @@ def view(
 
     def begin() -> Session:
         with common.show_progress(interruption, quiet=False) as progress:
-            return Session(loaded, captures, arch, threads, play=play, progress=lambda stage: progress(stage, 0, 0))
+            return Session(loaded, captures, progress=lambda stage: progress(stage, 0, 0), **settings)
 
     try:
         with (

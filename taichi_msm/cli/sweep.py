@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import click
 
 from taichi_msm.cli import common, options
-from taichi_msm.errors import LostExecutorError, printable
+from taichi_msm.errors import LostExecutorError
 from taichi_msm.system.process import write_stderr
 
 if TYPE_CHECKING:
@@ -21,7 +21,7 @@ MAX_UNCONFIRMED_RUNS = 10_000
 
 @options.program.command()
 @click.argument("file", metavar="SWEEP")
-@click.option("--out", metavar="DIR", help="Directory for the runs.  [default: output/<name of the sweep file>]")
+@options.out_option("Directory for the runs.", "output/<name of the sweep file>")
 @options.workers_option(help="Number of worker processes.  [default: one per core, limited by the memory]")
 @click.option("--dask", metavar="ADDRESS", help="Execute the runs in the workers of the dask scheduler at ADDRESS.")
 @click.option(
@@ -82,13 +82,9 @@ def sweep(
     except LostExecutorError as error:
         common.report_failure("error", [f"{error}; {_progress_message(len(outcomes), total)}"], as_json)
         return common.FILES
-    if as_json:
-        counts = count_statuses(outcomes)
-        common.print_json(
-            {"directory": str(directory), "runs": len(outcomes), **counts, "outputs": files, "notes": notes}
-        )
-    else:
-        click.echo("\n".join(map(printable, summary_lines(directory, outcomes, shard, files, notes))))
+    record = {"directory": str(directory), "runs": len(outcomes), **count_statuses(outcomes)}
+    lines = summary_lines(directory, outcomes, shard, files, notes)
+    common.print_result(as_json, {**record, "outputs": files, "notes": notes}, lines)
     return common.DONE
 
 
@@ -100,14 +96,10 @@ def _print_dry_run(loaded: Sweep, cost: SweepCost, shard: tuple[int, int], worke
     runs = range(part - 1, len(values), parts)
     cost = cost.scaled(len(runs) / len(values))
     worker_count = choose_worker_count(cost, len(runs), workers)
-    if as_json:
-        rows = {"keys": loaded.keys, "runs": list(runs), "values": [values[run] for run in runs]}
-        common.print_json({**rows, **cost._asdict(), "workers": worker_count.number})
-        return
-    click.echo(csv_line(["run", *loaded.keys]))
-    for run in runs:
-        click.echo(printable(csv_line([run, *map(format_cell, values[run])])))
-    click.echo(cost_line(len(runs), cost, worker_count))
+    record = {"keys": loaded.keys, "runs": list(runs), "values": [values[run] for run in runs]}
+    rows = (csv_line([run, *map(format_cell, values[run])]) for run in runs)
+    lines = (csv_line(["run", *loaded.keys]), *rows, cost_line(len(runs), cost, worker_count))
+    common.print_result(as_json, {**record, **cost._asdict(), "workers": worker_count.number}, lines)
 
 
 def _progress_message(done: int, total: int) -> str:
