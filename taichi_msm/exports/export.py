@@ -48,6 +48,14 @@ EXPORT_PATTERNS = (
     *dict.fromkeys(pattern for export_format in FORMATS.values() for pattern in export_format.file_patterns),
 )
 
+EXPORT_PUBLICATION = PublicationSpec(
+    "export",
+    EXPORT_RECORD,
+    EXPORT_PATTERNS,
+    lambda record: {EXPORT_RECORD, *record["files"]}.__contains__,
+    exclusive=True,
+)
+
 
 class Exported(NamedTuple):
     """Result of an export."""
@@ -148,14 +156,7 @@ def _write_export(
         done += run.frames
     progress(0, total)
     notes: dict[str, list[Path]] = {}
-    spec = PublicationSpec(
-        name="export",
-        record=EXPORT_RECORD,
-        patterns=EXPORT_PATTERNS,
-        read_record=lambda record: {EXPORT_RECORD, *record["files"]}.__contains__,
-        exclusive=True,
-    )
-    with writing(directory), Publication(directory, spec) as publication:
+    with writing(directory), Publication(directory, EXPORT_PUBLICATION) as publication:
         for run in chain.from_iterable(camera_runs):
             with run.unchanged():
                 if missing := [key for key in export_format.required_outputs if not run.has_output(key)]:

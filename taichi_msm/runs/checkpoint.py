@@ -29,9 +29,10 @@ from pydantic import TypeAdapter
 
 from taichi_msm.accuracy.mesh import MeshEstimate
 from taichi_msm.accuracy.time_step import TimeStepEstimate
-from taichi_msm.errors import DamagedError, FilesError, ForeignError, SceneError
+from taichi_msm.errors import DamagedError, FilesError, ForeignError, SceneError, writing
 from taichi_msm.images import PictureError, file_sha256
 from taichi_msm.model.plan import Plan
+from taichi_msm.model.time_grid import DTYPES
 from taichi_msm.render.camera import camera_problems
 from taichi_msm.runs.arrays import read_array, read_rows, write_arrays
 from taichi_msm.runs.directory import FILE, FOLDER, STAGING_FOLDER, create_file, require_kind
@@ -178,9 +179,10 @@ class Checkpoint:
     def __init__(self, folder: Path, plan: Plan) -> None:
         scene = plan.scene
         self.frames = 0  # number of frames stored so far
-        self.precision = np.dtype(np.float32 if plan.grid.precision == "f32" else np.float64)  # of the positions
+        self.precision = DTYPES[plan.grid.precision]  # of the positions
         self._plan, self._state_path, self._frames_path = plan, folder / STATE_FILE, folder / FRAMES_FILE
         self._next_save, self._manifest = 0.0, b""
+        self._directory = folder.parent.parent  # of the results, for messages
         self._file: BinaryIO | None = None  # None without outputs: the frames are not needed
         position = "position", self.precision, (*scene.sheet.points, 3)
         forces = "forces", np.float64, (len(scene.probes), FORCE_COLUMNS)
@@ -188,8 +190,8 @@ class Checkpoint:
 
     @property
     def is_save_due(self) -> bool:
-        """Whether the state should be saved again."""
-        return time.perf_counter() >= self._next_save
+        """Whether the state should be saved, and all of its frames are stored."""
+        return self.frames > 0 and time.perf_counter() >= self._next_save
 
     def begin(self, manifest: Mapping[str, Any]) -> None:
         """Begin the checkpoint of a new run in place of an earlier one."""
@@ -250,7 +252,8 @@ class Checkpoint:
         The archive has the fields of `State` and `RunProgress` by name.
         """
         start = time.perf_counter()
-        self._write_state(_to_arrays(saved))
+        with writing(self._directory):
+            self._write_state(_to_arrays(saved))
         now = time.perf_counter()
         # Saving takes at most 2 % of the run's time.
         self._next_save = now + (now - start) / 0.02
@@ -303,8 +306,9 @@ class Checkpoint:
     def _read(self, frame: int) -> tuple[NDArray[Any], NDArray[np.float64]]:
         """Read positions and forces of a frame; raise a DamagedError for non-finite values or a wrong checksum."""
         assert self._file
-        self._file.seek(frame * self._frame_dtype.itemsize)
-        records = np.fromfile(self._file, self._frame_dtype, 1)
+        with writing(self._directory):
+            self._file.seek(frame * self._frame_dtype.itemsize)
+            records = np.fromfile(self._file, self._frame_dtype, 1)
         if len(records) == 1:
             position, forces = records["position"][0], records["forces"][0]
             is_sound = records["checksum"][0] == self._checksum(frame, position, forces)

@@ -46,11 +46,8 @@ class EncodingJob(NamedTuple):
         return [folder / OUTPUTS["png"].path(number) for folder in self.folders if "png" in self.outputs]
 
 
-class EncodingReport(NamedTuple):
-    """Result of an encoding job."""
-
-    frames: int  # number of completely encoded frames
-    seconds: float  # processor time
+# Number of completely encoded frames, and the processor time [s].
+EncodingReport = tuple[int, float]
 
 
 class PictureWriter:
@@ -96,7 +93,7 @@ class PictureWriter:
         for number in range(self._frames, self._added_frames):
             for path in self._job.still_paths(number):
                 path.unlink(missing_ok=True)
-        return EncodingReport(self._frames, self._seconds)
+        return self._frames, self._seconds
 
     def abort(self) -> None:
         """End the threads and close incomplete files."""
@@ -192,7 +189,7 @@ class Encoder:
             result = pickle.loads(self._report_data) if self._report_data else None
             if isinstance(result, Exception):
                 raise result
-            if not isinstance(result, EncodingReport):
+            if not isinstance(result, tuple):
                 raise ChildProcessError(f"the encoder ended with exit code {exit_code}")
             self._report = result
         return self._report

@@ -262,7 +262,7 @@ class _Run:
         writer = ResultWriter(context.directory, plan, manifest.as_json(), resumes=resumes, threads=device.threads)
         self._writer = opened.enter_context(writer)
         self._simulation = opened.enter_context(Simulation(plan, device.arch, device.threads, context.texture, cores))
-        self._resumed_frames = self._writer.stored_frames
+        self._resumed_frames = self._writer.checkpoint.frames
         companions = _choose_companions(context, resumed=self._resumed_frames > 0)
         self._error_estimator: RunErrorEstimator | None = None
         self._path_dependence = PathDependence(plan) if plan.scene.time.at_rest else None
@@ -282,7 +282,7 @@ class _Run:
         """Verify the checksums of stored positions before they are used."""
         for frame in range(self._resumed_frames if self._context.plan.scene.output else 0):
             self._progress("check", frame, self._resumed_frames)
-            self._writer.read_positions(frame)
+            self._writer.checkpoint.read_positions(frame)
 
     def prepare(self) -> None:
         """Compile, and restore the simulation to the state of the unfinished run."""
@@ -308,7 +308,8 @@ class _Run:
             report()
             with stage("simulate"):
                 simulation.advance(max(0, frame - simulation.frame), self._pause)
-            position = writer.read_positions(frame) if frame < self._resumed_frames else simulation.positions()
+            is_stored = frame < self._resumed_frames
+            position = writer.checkpoint.read_positions(frame) if is_stored else simulation.positions()
             if frame == writer.frames:  # otherwise it is stored, and has no pictures or labels
                 with stage("render"):
                     time = frame / scene.time.frames_per_second
@@ -327,7 +328,7 @@ class _Run:
         if self._error_estimator and frame > 0:
             with self._stopwatch.stage("pilot"):
                 is_stored = frame < self._resumed_frames
-                by_probe = self._writer.read_forces(frame) if is_stored else self._simulation.forces()
+                by_probe = self._writer.checkpoint.read_forces(frame) if is_stored else self._simulation.forces()
                 forces = np.array([by_probe[tool.probe].force for tool in self._context.plan.tools]).reshape(-1, 3)
                 self._error_estimator.compare_frame(displacement, pause, forces)
 
@@ -336,7 +337,7 @@ class _Run:
         scene, stage = self._context.plan.scene, self._stopwatch.stage
         if self._error_estimator:
             rest = rest_positions(scene.sheet)
-            displacements = (self._writer.read_positions(frame) - rest for frame in range(1, self._frames))
+            displacements = (self._writer.checkpoint.read_positions(frame) - rest for frame in range(1, self._frames))
             with stage("pilot"):
                 self._error_estimator.finish(displacements if scene.output else None, partial(self._progress, "pilot"))
         if self._path_dependence and self._seeks_second_solutions:
@@ -348,10 +349,10 @@ class _Run:
         """Save the state and the finished frames of an interrupted run; reraise if there is no new frame."""
         writer, simulation = self._writer, self._simulation
         # A saved state needs all of its frames, and the last simulated frame may not be stored yet.
-        if simulation.steps > 0 and simulation.frame < writer.stored_frames and not simulation.inconsistent:
+        if simulation.steps > 0 and simulation.frame < writer.checkpoint.frames and not simulation.inconsistent:
             # A divergence within this frame will recur in the resumed run.
             with suppress(DivergedError):
-                writer.save(simulation.save())
+                writer.checkpoint.save(simulation.save())
         if writer.frames > self._resumed_frames:
             writer.finish()
         if writer.frames <= self._resumed_frames:  # `finish` drops an incomplete last frame
@@ -365,10 +366,10 @@ class _Run:
         ending: dict[str, Any] = {"status": "diverged", "error": str(error), "dump": None}
         with suppress(KeyboardInterrupt):
             report = partial(self._progress, "diagnosis", writer.frames, self._frames)
-            diagnosis = self._simulation.diagnose(writer.load(), report)
+            diagnosis = self._simulation.diagnose(writer.checkpoint.load(), report)
             ending["error"] = diagnosis.message
             if diagnosis.last_sound_state:
-                ending["dump"] = writer.save(diagnosis.last_sound_state)
+                ending["dump"] = writer.checkpoint.save(diagnosis.last_sound_state)
         return ending
 
     def publish_results(self, ending: dict[str, Any]) -> RunRecord:
@@ -438,8 +439,8 @@ class _Run:
         """Report the progress within a frame, and save the state when due."""
         with self._stopwatch.stage("write"):
             self._progress("frames", self._writer.frames, self._frames)
-            if self._writer.is_save_due:
-                self._writer.save(self._simulation.save())
+            if self._writer.checkpoint.is_save_due:
+                self._writer.checkpoint.save(self._simulation.save())
 
 
 def _choose_companions(context: _RunContext, *, resumed: bool) -> CompanionRuns:

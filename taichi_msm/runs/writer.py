@@ -29,7 +29,7 @@ from taichi_msm.runs.encoder import Encoder, EncodingJob, PictureWriter
 from taichi_msm.scene import outputs
 from taichi_msm.scene.outputs import CAMERA_FILE, OUTPUTS
 from taichi_msm.scene.scene import Scene
-from taichi_msm.solver.state import Snapshot, TipForce
+from taichi_msm.solver.state import TipForce
 
 RUN_PUBLICATION = PublicationSpec(
     "run",
@@ -78,28 +78,13 @@ class ResultWriter(AbstractContextManager["ResultWriter"]):
                 locks = self._publication.lock_descriptors
                 self._encoder = Encoder(job, locks) if threads > 1 else PictureWriter(job)
                 opened.callback(self._encoder.abort)
-            self._checkpoint = Checkpoint(self._publication.staging_folder / CHECKPOINT_FOLDER, plan)
-            opened.callback(self._checkpoint.close)
+            self.checkpoint = Checkpoint(self._publication.staging_folder / CHECKPOINT_FOLDER, plan)
+            opened.callback(self.checkpoint.close)
             # State from which the run continues; None for the initial state.
-            self.saved = self._checkpoint.reopen() if resumes else None
+            self.saved = self.checkpoint.reopen() if resumes else None
             # Number of frames in the results; after an interruption, valid after `finish`.
-            self.frames = 0 if scene.renders else self.stored_frames
+            self.frames = 0 if scene.renders else self.checkpoint.frames
             self._open = opened.pop_all()
-
-    @property
-    def stored_frames(self) -> int:
-        """Number of frames in the checkpoint, including those before the resumption."""
-        return self._checkpoint.frames
-
-    def read_positions(self, frame: int) -> NDArray[Any]:
-        """Read the positions of the mass points in a stored frame [m], shape (rows, cols, 3)."""
-        with writing(self._directory):
-            return self._checkpoint.read_positions(frame)
-
-    def read_forces(self, frame: int) -> tuple[TipForce, ...]:
-        """Read the force of every probe in a stored frame."""
-        with writing(self._directory):
-            return self._checkpoint.read_forces(frame)
 
     def add(
         self, position: NDArray[Any], observed: Mapping[str, FrameOutputs], forces: Sequence[TipForce] = ()
@@ -110,11 +95,11 @@ class ResultWriter(AbstractContextManager["ResultWriter"]):
         """
         with writing(self._directory):
             # Positions are stored first, so that an interruption never leaves a picture without positions.
-            if self.stored_frames == 0:
+            if self.checkpoint.frames == 0:
                 self._publication.keep_unpublished = False
-                self._checkpoint.begin(self._manifest or {})
-            if self.frames == self.stored_frames:
-                self._checkpoint.add(position, forces)
+                self.checkpoint.begin(self._manifest or {})
+            if self.frames == self.checkpoint.frames:
+                self.checkpoint.add(position, forces)
                 self._publication.keep_unpublished = self._manifest is not None
             for name, labels in self._labels.items():
                 labels.add(self.frames, observed[name], position)
@@ -122,21 +107,6 @@ class ResultWriter(AbstractContextManager["ResultWriter"]):
                 pictures = [frame.picture for frame in observed.values() if frame.picture is not None]
                 self._encoder.add(np.stack(pictures) if len(pictures) > 1 else pictures[0][None])
             self.frames += 1
-
-    @property
-    def is_save_due(self) -> bool:
-        """Whether the state of the run should be saved."""
-        return self.stored_frames > 0 and self._checkpoint.is_save_due
-
-    def save(self, saved: Snapshot) -> str:
-        """Save a state of the run in the checkpoint, and return the path of the file."""
-        with writing(self._directory):
-            return self._checkpoint.save(saved)
-
-    def load(self) -> Snapshot | None:
-        """Read the last saved state; None without one."""
-        with writing(self._directory):
-            return self._checkpoint.load()
 
     def finish(self) -> None:
         """Wait until all frames are encoded, and write the files that combine frames."""
@@ -165,13 +135,13 @@ class ResultWriter(AbstractContextManager["ResultWriter"]):
             write_new_file(self._publication.new_folder / outputs.RUN_RECORD, text.encode("utf-8", "backslashreplace"))
             self._publication.publish(outputs.file_names(results, self.frames))
             if record.get("status") == "complete":
-                self._checkpoint.invalidate()
+                self.checkpoint.invalidate()
                 self._publication.keep_unpublished = False
         return complete_record
 
     def _write_trajectory(self) -> None:
         """Write times [s] and positions [m] of all frames, in chunks, because they may exceed memory."""
-        checkpoint, frames = self._checkpoint, self.frames
+        checkpoint, frames = self.checkpoint, self.frames
         shape = (frames, *self._scene.sheet.points, 3)
         arrays: dict[str, NDArray[Any] | ChunkedArray] = {
             "time": np.arange(frames) / self._scene.time.frames_per_second,
@@ -190,7 +160,7 @@ class ResultWriter(AbstractContextManager["ResultWriter"]):
             rows.writerow(outputs.FORCES_HEADER)
             for frame in range(self.frames):
                 time = frame / self._scene.time.frames_per_second
-                forces = self._checkpoint.read_forces(frame)
+                forces = self.checkpoint.read_forces(frame)
                 rows.writerows((time, force.probe, *force.tip, *force.force) for force in forces)
 
     def __exit__(self, *_: object) -> None:
