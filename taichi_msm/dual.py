@@ -90,11 +90,7 @@ def dual_operations(base: Operations) -> Operations:
         return of_dual
 
     def where(condition: Any, a: Any, b: Any) -> Any:
-        either = a if isinstance(a, Dual) else b
-        if not isinstance(either, Dual):
-            return base.where(condition, a, b)
-        (value, slope), (other, other_slope) = _parts(a), _parts(b)
-        return either._new(base.where(condition, value, other), base.where(condition, slope, other_slope))
+        return choose(lambda value, other: base.where(condition, value, other), lambda *_: condition)(a, b)
 
     return base._replace(
         wrap=unchanged,

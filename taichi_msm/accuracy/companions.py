@@ -82,9 +82,8 @@ def choose_companion_runs(plan: Plan, *, requested: bool = False) -> CompanionRu
         return requested or affords_companions(plan, cost + subsequent_cost + repetition)
 
     second = mesh_cost > 0 and plan.has_contact and affords(SECOND_MESH_COST)
-    if not coarse:
-        return CompanionRuns(fine, 0, mesh_cost > 0, cost, second_mesh=second)
-    return CompanionRuns(coarse, fine if affords(fine_cost) else 0, mesh_cost > 0, cost, second_mesh=second)
+    first, subsequent = (coarse, fine if affords(fine_cost) else 0) if coarse else (fine, 0)
+    return CompanionRuns(first, subsequent, mesh_cost > 0, cost, second_mesh=second)
 
 
 def coarse_steps(plan: Plan) -> int:

@@ -39,21 +39,17 @@ from taichi_msm.runs.directory import (
 from taichi_msm.runs.finished import RESTORE_PICTURE, FinishedRun
 from taichi_msm.scene.outputs import OUTPUTS, is_formula, zero_padded
 
-EXPORT_RECORD = "export.json"
+RECORD = "export.json"
 
 # Files of all formats, because the export that is replaced may have another format. Other files are errors.
-EXPORT_PATTERNS = (
+PATTERNS = (
     r"export\.json",
     r"index\.csv",
     *dict.fromkeys(pattern for export_format in FORMATS.values() for pattern in export_format.file_patterns),
 )
 
-EXPORT_PUBLICATION = PublicationSpec(
-    "export",
-    EXPORT_RECORD,
-    EXPORT_PATTERNS,
-    lambda record: {EXPORT_RECORD, *record["files"]}.__contains__,
-    exclusive=True,
+PUBLICATION = PublicationSpec(
+    "export", RECORD, PATTERNS, lambda record: {RECORD, *record["files"]}.__contains__, exclusive=True
 )
 
 
@@ -156,7 +152,7 @@ def _write_export(
         done += run.frames
     progress(0, total)
     notes: dict[str, list[Path]] = {}
-    with writing(directory), Publication(directory, EXPORT_PUBLICATION) as publication:
+    with writing(directory), Publication(directory, PUBLICATION) as publication:
         for run in chain.from_iterable(camera_runs):
             with run.unchanged():
                 if missing := [key for key in export_format.required_outputs if not run.has_output(key)]:
@@ -169,11 +165,9 @@ def _write_export(
                     notes.setdefault(note, []).append(run.directory)
         next(writer, None)  # writes the files that combine runs
         _write_index(runs, export_format.numbers_pairs, publication.new_folder / "index.csv")
-        written = sorted(list_files(publication.new_folder, EXPORT_PATTERNS, strict=True))
-        write_new_file(
-            publication.new_folder / EXPORT_RECORD, (json.dumps({"files": written}, indent=1) + "\n").encode()
-        )
-        publication.publish([*written, EXPORT_RECORD])
+        written = sorted(list_files(publication.new_folder, PATTERNS, strict=True))
+        write_new_file(publication.new_folder / RECORD, (json.dumps({"files": written}, indent=1) + "\n").encode())
+        publication.publish([*written, RECORD])
     return Exported(
         directory,
         written,

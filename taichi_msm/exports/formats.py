@@ -13,16 +13,19 @@ from taichi_msm.runs.finished import FinishedRun, read_run, reading
 from taichi_msm.scene.outputs import NUMBER_PATTERN, RUN_RECORD, RUNS_FOLDER, SWEEP_RECORD, zero_padded
 from taichi_msm.system.files import read_regular
 
+# Value of `Format.cameras` for the camera of the user's choice, or the only one.
+ANY_CAMERA = ("",)
+
 
 class Format(NamedTuple):
     """Export format."""
 
     description: str  # for the help text
-    required_outputs: tuple[str, ...]  # entries of a scene's `output`
     file_patterns: tuple[str, ...]  # regular expressions, for `list_files`
+    required_outputs: tuple[str, ...] = ("trajectory",)  # entries of a scene's `output`
     optional_outputs: tuple[str, ...] = ()  # further exported entries of `output`
     numbers_pairs: bool = False  # whether files are numbered by pair of frames, and not by run
-    cameras: tuple[str, ...] = ()  # names of the exported cameras, or ANY_CAMERA; empty for a format without camera
+    cameras: tuple[str, ...] = ANY_CAMERA  # names of the exported cameras; empty for a format without camera
     module: str = ""  # name of the module; empty for the name of the format
 
 
@@ -31,73 +34,54 @@ def _patterns_per_run(*patterns: str) -> tuple[str, ...]:
     return (*patterns, *(f"{NUMBER_PATTERN}/{pattern}" for pattern in patterns))
 
 
-# Value of `Format.cameras` for the camera of the user's choice, or the only one.
-ANY_CAMERA = ("",)
-
 FORMATS = {
     "kitti": Format(
         "optical flow",
-        required_outputs=("flow",),
-        optional_outputs=("occlusion", "png"),
-        file_patterns=(
+        (
             rf"training/image_2/{NUMBER_PATTERN}_1[01]\.png",
             rf"training/flow_occ/{NUMBER_PATTERN}_10\.png",
             rf"training/flow_noc/{NUMBER_PATTERN}_10\.png",
         ),
+        required_outputs=("flow",),
+        optional_outputs=("occlusion", "png"),
         numbers_pairs=True,
-        cameras=ANY_CAMERA,
     ),
-    "tapvid": Format(
-        "tracks of points", required_outputs=("tracks", "png"), file_patterns=(r"tapvid\.pkl",), cameras=ANY_CAMERA
-    ),
-    "tapvid3d": Format(
-        "tracks of points in space",
-        required_outputs=("tracks", "png"),
-        file_patterns=(rf"{NUMBER_PATTERN}\.npz",),
-        cameras=ANY_CAMERA,
-    ),
+    "tapvid": Format("tracks of points", (r"tapvid\.pkl",), required_outputs=("tracks", "png")),
+    "tapvid3d": Format("tracks of points in space", (rf"{NUMBER_PATTERN}\.npz",), required_outputs=("tracks", "png")),
     "stir": Format(
         "tracks of points in stereo",
-        required_outputs=("tracks", "png"),
-        file_patterns=(
+        (
             rf"{NUMBER_PATTERN}/calib\.json",
             rf"{NUMBER_PATTERN}/(?:left|right)/seq00/frames/0ms-[0-9]+ms-visible\.mp4",
             rf"{NUMBER_PATTERN}/(?:left|right)/seq00/[0-9]+ms_icg(?:start|end)\.png",
             rf"{NUMBER_PATTERN}/(?:left|right)/seq00/segmentation/icg(?:start|end)seg\.png",
         ),
+        required_outputs=("tracks", "png"),
         cameras=("left", "right"),
     ),
     "endonerf": Format(
         "neural reconstruction of tissue",
+        _patterns_per_run(rf"(?:images|depth|masks)/{NUMBER_PATTERN}\.png", r"poses_bounds\.npy"),
         required_outputs=("depth", "instrument", "png"),
-        file_patterns=_patterns_per_run(rf"(?:images|depth|masks)/{NUMBER_PATTERN}\.png", r"poses_bounds\.npy"),
-        cameras=ANY_CAMERA,
     ),
     "rerun": Format(
         "for the viewer of rerun.io",
-        required_outputs=("trajectory",),
+        (rf"{NUMBER_PATTERN}\.rrd",),
         optional_outputs=("png", "depth", "flow", "tracks"),
-        file_patterns=(rf"{NUMBER_PATTERN}\.rrd",),
+        cameras=(),
     ),
-    "vtk": Format(
-        "for ParaView",
-        required_outputs=("trajectory",),
-        file_patterns=_patterns_per_run(r"[0-9]{4,}\.vtu", r"surface\.pvd", r"picture\.png"),
-    ),
-    "gltf": Format(
-        "for Blender and browsers", required_outputs=("trajectory",), file_patterns=_patterns_per_run(r"surface\.glb")
-    ),
+    "vtk": Format("for ParaView", _patterns_per_run(r"[0-9]{4,}\.vtu", r"surface\.pvd", r"picture\.png"), cameras=()),
+    "gltf": Format("for Blender and browsers", _patterns_per_run(r"surface\.glb"), cameras=()),
     "obj": Format(
         "for other programs with surfaces",
-        required_outputs=("trajectory",),
-        file_patterns=_patterns_per_run(r"[0-9]{4,}\.obj", r"surface\.mtl", r"picture\.png"),
+        _patterns_per_run(r"[0-9]{4,}\.obj", r"surface\.mtl", r"picture\.png"),
+        cameras=(),
     ),
     "csv": Format(
         "forces and tracks as tables",
+        (r"forces\.csv", r"tracks\.csv"),
         required_outputs=(),
         optional_outputs=("forces", "tracks"),
-        file_patterns=(r"forces\.csv", r"tracks\.csv"),
-        cameras=ANY_CAMERA,
         module="csv_tables",
     ),
 }

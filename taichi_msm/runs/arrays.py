@@ -35,22 +35,13 @@ def write_arrays(file: BinaryIO, arrays: Mapping[str, NDArray[Any] | ChunkedArra
     """Write arrays, by name, to an uncompressed .npz archive; equal arrays produce identical files."""
     with zipfile.ZipFile(file, "w", zipfile.ZIP_STORED) as archive:
         for name, array in arrays.items():
-            chunked = _chunked(array)
+            chunks = array.chunks if isinstance(array, ChunkedArray) else [np.ascontiguousarray(array)]
             # A fixed date, the earliest of the zip format, keeps equal files identical.
             info = zipfile.ZipInfo(f"{name}.npy", (1980, 1, 1, 0, 0, 0))
             with archive.open(info, "w", force_zip64=True) as entry:
-                entry.write(_npy_header(chunked.dtype, chunked.shape))
-                for chunk in chunked.chunks:
+                entry.write(_npy_header(array.dtype, array.shape))
+                for chunk in chunks:
                     entry.write(chunk.data)
-
-
-def _chunked(array: NDArray[Any] | ChunkedArray) -> ChunkedArray:
-    """Split an array into contiguous chunks, without a copy of all of it."""
-    if isinstance(array, ChunkedArray):
-        return array
-    return ChunkedArray(
-        array.dtype, array.shape, [array] if array.flags.c_contiguous else map(np.ascontiguousarray, array)
-    )
 
 
 def read_array(archive: zipfile.ZipFile, name: str, dtype: DTypeLike, shape: Shape) -> NDArray[Any]:
