@@ -44,20 +44,14 @@ class ResultWriter(AbstractContextManager["ResultWriter"]):
     """Streaming writer of the results of a run, as a context manager.
 
     Files are written to a hidden folder, and `publish` moves them into place atomically. Without `publish`, they are
-    deleted at exit. With a manifest, a checkpoint exists from the first frame to the publication of complete results,
+    deleted at exit. A checkpoint with the manifest exists from the first frame to the publication of complete results,
     and a later writer `resumes` from it. With one of `threads`, no core is free for an encoding process, and `add`
     encodes the pictures. Foreign files in the directory are never changed; one at the path of a result is a FilesError,
     as is another run that writes there.
     """
 
     def __init__(
-        self,
-        directory: Path,
-        plan: Plan,
-        manifest: Mapping[str, Any] | None = None,
-        *,
-        resumes: bool = False,
-        threads: int = 2,
+        self, directory: Path, plan: Plan, manifest: Mapping[str, Any], *, resumes: bool = False, threads: int = 2
     ) -> None:
         self._directory, self._manifest = directory, manifest
         self._scene = scene = plan.scene
@@ -97,10 +91,10 @@ class ResultWriter(AbstractContextManager["ResultWriter"]):
             # Positions are stored first, so that an interruption never leaves a picture without positions.
             if self.checkpoint.frames == 0:
                 self._publication.keep_unpublished = False
-                self.checkpoint.begin(self._manifest or {})
+                self.checkpoint.begin(self._manifest)
             if self.frames == self.checkpoint.frames:
                 self.checkpoint.add(position, forces)
-                self._publication.keep_unpublished = self._manifest is not None
+                self._publication.keep_unpublished = True
             for name, labels in self._labels.items():
                 labels.add(self.frames, observed[name], position)
             if self._encoder:

@@ -44,12 +44,17 @@ from taichi_msm.runs.writer import ResultWriter
 from tests.scenes import plan_of
 from tests.runs.test_files import picture, position, small_scene
 
-with ResultWriter(Path(sys.argv[1]), plan_of(small_scene())) as writer:
+with ResultWriter(Path(sys.argv[1]), plan_of(small_scene()), {}) as writer:
     for frame in itertools.count():
         writer.add(position(frame), {"": FrameOutputs(picture(frame))})
         if frame == 10:
             print(writer._encoder._process.pid, flush=True)
 """
+
+
+def results(folder: Path) -> dict[str, bytes]:
+    """Content of the results by path, without the checkpoint of a run that is not complete."""
+    return {path: content for path, content in files(folder).items() if not path.startswith(".partial/checkpoint/")}
 
 
 def small_scene(*output: str, precision: str = "f32", **render: Any) -> Scene:
@@ -78,7 +83,7 @@ def observed(frame: int) -> dict[str, FrameOutputs]:
 
 
 def write(directory: Path, frames: int, scene: Scene, *, in_subprocess: bool = True) -> list[str]:
-    with ResultWriter(directory, plan_of(scene), threads=1 + in_subprocess) as writer:
+    with ResultWriter(directory, plan_of(scene), {}, threads=1 + in_subprocess) as writer:
         for frame in range(frames):
             writer.add(position(frame), observed(frame) if scene.draws else {"": FrameOutputs()})
         names: list[str] = writer.publish({})["outputs"]
@@ -92,7 +97,7 @@ def test_results_of_a_run(tmp_path: Path) -> None:
     names = write(out, 11, small_scene())
     assert names == ["frames", "animation.gif", "trajectory.npz", "run.json"]
     frames = [f"frames/{frame:04}.png" for frame in range(11)]
-    assert sorted(files(out)) == sorted([*frames, *names[1:]])
+    assert sorted(results(out)) == sorted([*frames, *names[1:]])
     for number, frame in enumerate(frames):
         with Image.open(out / frame) as image:
             np.testing.assert_array_equal(np.asarray(image), picture(number))
@@ -105,7 +110,7 @@ def test_results_of_a_run(tmp_path: Path) -> None:
 def test_equal_runs_write_equal_bytes(in_subprocess: bool, tmp_path: Path) -> None:
     write(tmp_path / "first", 7, small_scene())
     write(tmp_path / "second", 7, small_scene(), in_subprocess=in_subprocess)
-    assert files(tmp_path / "first") == files(tmp_path / "second")
+    assert results(tmp_path / "first") == results(tmp_path / "second")
 
 
 def test_only_requested_outputs_remain(tmp_path: Path) -> None:
@@ -118,7 +123,7 @@ def test_only_requested_outputs_remain(tmp_path: Path) -> None:
         (scene(output=[]), ["run.json"]),
     ):
         assert write(tmp_path, 3, made) == names
-        assert sorted(path.name for path in tmp_path.iterdir()) == sorted([*names, "notes.txt"])
+        assert {name.partition("/")[0] for name in results(tmp_path)} == {*names, "notes.txt"}
         assert len(list((tmp_path / "frames").glob("*"))) == (3 if "frames" in names else 0)
 
 
@@ -144,7 +149,7 @@ def test_animation_colours_under_changing_light(tmp_path: Path, light: float) ->
     later[:8] = (first[:8] * light).astype(np.uint8)
     background = (1, 99, 255)
     first[:, 0] = later[:, 0] = background
-    with ResultWriter(tmp_path, plan_of(small_scene("gif", background=background, size=[16, 16]))) as writer:
+    with ResultWriter(tmp_path, plan_of(small_scene("gif", background=background, size=[16, 16])), {}) as writer:
         writer.add(position(0), {"": FrameOutputs(first)})
         writer.add(position(1), {"": FrameOutputs(later)})
         writer.publish({})
@@ -159,12 +164,12 @@ def test_animation_colours_under_changing_light(tmp_path: Path, light: float) ->
 @pytest.mark.parametrize("in_subprocess", [True, False])
 def test_unpublished_results_are_discarded(in_subprocess: bool, tmp_path: Path) -> None:
     write(tmp_path / "out", 3, small_scene())
-    before = files(tmp_path / "out")
+    before = results(tmp_path / "out")
     for directory in (tmp_path / "out", tmp_path / "fresh"):
-        with ResultWriter(directory, plan_of(small_scene()), threads=1 + in_subprocess) as writer:
+        with ResultWriter(directory, plan_of(small_scene()), {}, threads=1 + in_subprocess) as writer:
             writer.add(position(9), {"": FrameOutputs(picture(9))})
-    assert files(tmp_path / "out") == before
-    assert not (tmp_path / "fresh").exists()
+    assert results(tmp_path / "out") == before
+    assert results(tmp_path / "fresh") == {}
 
 
 @pytest.mark.parametrize(("rows", "frames"), [(HEIGHT // 2, 1), (HEIGHT, 2)])
@@ -178,7 +183,7 @@ def test_interruption_between_positions_and_picture(
         raise KeyboardInterrupt
 
     add, made = Encoder.add, small_scene("png", "gif", "trajectory", "flow")
-    with ResultWriter(tmp_path / "interrupted", plan_of(made)) as writer:
+    with ResultWriter(tmp_path / "interrupted", plan_of(made), {}) as writer:
         writer.add(position(0), observed(0))
         with monkeypatch.context() as patch:
             patch.setattr(Encoder, "add", interrupted)
@@ -188,7 +193,7 @@ def test_interruption_between_positions_and_picture(
         assert writer.frames == frames
         writer.publish({})
     write(tmp_path / "whole", frames, made)
-    assert files(tmp_path / "interrupted") == files(tmp_path / "whole")
+    assert results(tmp_path / "interrupted") == results(tmp_path / "whole")
 
 
 @pytest.mark.parametrize(("owner", "part"), [(Image.Image, "save"), (media.GifWriter, "_write_last")])
@@ -203,7 +208,7 @@ def test_interruption_during_encoding_in_threads(
         time.sleep(0.3)  # until the main thread is interrupted
         return original(*arguments, **keywords)
 
-    with ResultWriter(tmp_path / "interrupted", plan_of(small_scene()), threads=1) as writer:
+    with ResultWriter(tmp_path / "interrupted", plan_of(small_scene()), {}, threads=1) as writer:
         writer.add(position(0), {"": FrameOutputs(picture(0))})
         with monkeypatch.context() as patch:
             patch.setattr(owner, part, interrupted)
@@ -214,7 +219,7 @@ def test_interruption_during_encoding_in_threads(
         writer.publish({})
         frames = writer.frames
     write(tmp_path / "whole", frames, small_scene())
-    assert files(tmp_path / "interrupted") == files(tmp_path / "whole")
+    assert results(tmp_path / "interrupted") == results(tmp_path / "whole")
 
 
 def test_interruption_between_still_and_film(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -225,7 +230,7 @@ def test_interruption_between_still_and_film(tmp_path: Path, monkeypatch: pytest
         return write_still(*arguments)
 
     write_still = encoder._write_still
-    with ResultWriter(tmp_path / "interrupted", plan_of(small_scene()), threads=1) as writer:
+    with ResultWriter(tmp_path / "interrupted", plan_of(small_scene()), {}, threads=1) as writer:
         writer.add(position(0), observed(0))
         assert isinstance(writer._encoder, PictureWriter)
         with monkeypatch.context() as patch:
@@ -237,7 +242,7 @@ def test_interruption_between_still_and_film(tmp_path: Path, monkeypatch: pytest
         time.sleep(0.2)
         writer.publish({})
     write(tmp_path / "whole", 1, small_scene())
-    assert files(tmp_path / "interrupted") == files(tmp_path / "whole")
+    assert results(tmp_path / "interrupted") == results(tmp_path / "whole")
 
 
 def test_published_run_is_finished(tmp_path: Path) -> None:
@@ -253,7 +258,7 @@ def test_published_run_is_finished(tmp_path: Path) -> None:
 
 def test_killed_run_and_its_successor(tmp_path: Path, root: Path, message: Messages) -> None:
     write(tmp_path, 3, small_scene())
-    before = files(tmp_path)
+    before = results(tmp_path)
     command = [sys.executable, "-c", ENDLESS, str(tmp_path)]
     with subprocess.Popen(command, cwd=root, stdout=subprocess.PIPE, stderr=subprocess.PIPE) as run:
         assert run.stdout
@@ -267,10 +272,10 @@ def test_killed_run_and_its_successor(tmp_path: Path, root: Path, message: Messa
             write(tmp_path, 2, small_scene())
         os.kill(encoder, signal.SIGCONT)
         run.communicate()  # until the encoder has ended
-    assert {name: data for name, data in files(tmp_path).items() if ".partial" not in name} == before
+    assert {name: data for name, data in results(tmp_path).items() if ".partial" not in name} == before
     write(tmp_path, 2, small_scene())
     assert len(list((tmp_path / "frames").iterdir())) == 2
-    assert not (tmp_path / ".partial").exists()
+    assert not any(".partial" in name for name in results(tmp_path))
 
 
 def full_disk(*_: object, **__: object) -> None:
@@ -281,11 +286,11 @@ def full_disk(*_: object, **__: object) -> None:
 def test_full_disk(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, target: str, message: Messages) -> None:
     """While positions, manifest or record are written; results are unchanged."""
     write(tmp_path, 3, small_scene())
-    before = files(tmp_path)
+    before = results(tmp_path)
     monkeypatch.setattr(f"taichi_msm.runs.{target}", full_disk)
     with message.raises(FilesError, "--out"):
         write(tmp_path, 2, small_scene())
-    assert files(tmp_path) == before
+    assert results(tmp_path) == before
 
 
 def file_error(
@@ -294,7 +299,7 @@ def file_error(
     """Error message of a run that an event interrupts."""
 
     def run() -> None:
-        with ResultWriter(directory, plan_of(small_scene()), threads=1 + in_subprocess) as writer:
+        with ResultWriter(directory, plan_of(small_scene()), {}, threads=1 + in_subprocess) as writer:
             meanwhile(writer)
             for frame in range(1000):
                 writer.add(position(frame), {"": FrameOutputs(picture(frame))})
@@ -330,7 +335,7 @@ def test_errors_of_the_encoder(tmp_path: Path, message: Messages) -> None:
         writer._encoder._process.kill()
 
     message(file_error(tmp_path, kill), "encoder")
-    assert list(tmp_path.iterdir()) == []
+    assert results(tmp_path) == {}
 
 
 def test_deleted_directory(tmp_path: Path, message: Messages) -> None:
@@ -339,7 +344,7 @@ def test_deleted_directory(tmp_path: Path, message: Messages) -> None:
 
 
 def test_record_is_strict_json(tmp_path: Path) -> None:
-    with ResultWriter(tmp_path, plan_of(scene())) as writer:
+    with ResultWriter(tmp_path, plan_of(scene()), {}) as writer:
         with pytest.raises(ValueError, match="JSON"):
             writer.publish({"step": float("nan")})
         writer.publish({"image": "Schleimhaut-Ä.png", "odd": "\udcff.png"})
