@@ -141,32 +141,31 @@ def check(scene: str, image: str | None, overrides: tuple[str, ...], as_json: bo
         "probes": (records := probe_records(loaded)),
         "notes": [*force_warnings(loaded, records), *path_warnings(loaded, plan.tools), *drawing_warnings(loaded)],
     }
-    if as_json:
-        common.print_json(report)
-        return
     import yaml
 
     tolerances = [f"{name}.tolerance" for name in ("sheet", "time") if getattr(loaded, name).tolerance is not None]
     # With a tolerance, companion runs may refine the scene.
     more = ", or more" if tolerances else ""
     longer = f", or longer, if refined for {' and '.join(tolerances)}" if tolerances else ""
-    click.echo(yaml.safe_dump(report["scene"], sort_keys=False, default_flow_style=None), nl=False)
     stepping = (
         f"each at rest{more}, in {grid.precision}"
         if loaded.time.at_rest
         else f"{grid.steps} steps of {grid.step:.6g} s (limit {plan.stable_step:.6g} s{_lock_cost(plan)}), "
         f"{grid.steps_per_frame} a frame{more}, in {grid.precision}"
     )
-    click.echo(
-        f"\n{math.prod(loaded.sheet.points)} points, {budget.frames} frames, {stepping}\n"
-        f"about {cost.format_rough_time(duration.seconds)} to run{longer} (estimated from its work)\n"
-        f"about {budget.memory_bytes / 2**20:.0f} MiB of memory, at most {budget.disk_bytes / 2**20:.1f} MiB on disk, "
-        f"{budget.working_bytes / 2**20:.1f} MiB more while it runs"
-    )
     forces = enumerate(map(describe_forces, records))
-    lines = [f"probes.{index}: {description}" for index, description in forces if description]
-    for line in (*describe_cameras(loaded), *lines, *report["notes"]):
-        click.echo(line)
+    memory, disk, working = (size / 2**20 for size in (budget.memory_bytes, budget.disk_bytes, budget.working_bytes))
+    lines = [
+        *yaml.safe_dump(report["scene"], sort_keys=False, default_flow_style=None).splitlines(),
+        "",
+        f"{math.prod(loaded.sheet.points)} points, {budget.frames} frames, {stepping}",
+        f"about {cost.format_rough_time(duration.seconds)} to run{longer} (estimated from its work)",
+        f"about {memory:.0f} MiB of memory, at most {disk:.1f} MiB on disk, {working:.1f} MiB more while it runs",
+        *describe_cameras(loaded),
+        *(f"probes.{index}: {description}" for index, description in forces if description),
+        *report["notes"],
+    ]
+    common.print_result(as_json, report, lines)
 
 
 def _lock_cost(plan: Plan) -> str:
