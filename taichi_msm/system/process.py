@@ -28,19 +28,18 @@ CONTROL_GROUPS, MEMBERSHIP = Path("/sys/fs/cgroup"), Path("/proc/self/cgroup")
 def available_threads() -> int:
     """Return the number of cores that affinity and the quotas of control groups permit to this process."""
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-    quotas = [quota for group in _control_groups("cpu") if (quota := _quota(group)) is not None]
-    return max(1, min([cores, *map(math.floor, quotas)]))
+    return max(1, math.floor(min([cores, *map(_quota, _control_groups("cpu"))])))
 
 
-def _quota(group: Path) -> float | None:
-    """Read the number of cores that a control group (version 2 or 1) may use; None without a limit."""
+def _quota(group: Path) -> float:
+    """Read the number of cores that a control group (version 2 or 1) may use; infinite without a limit."""
     with suppress(OSError, ValueError):
         quota, period = map(int, (group / "cpu.max").read_text().split())
         return quota / period
     with suppress(OSError, ValueError):
         quota, period = (int((group / f"cpu.cfs_{name}_us").read_text()) for name in ("quota", "period"))
-        return quota / period if quota > 0 else None
-    return None
+        return quota / period if quota > 0 else math.inf
+    return math.inf
 
 
 def _control_groups(controller: str) -> Iterator[Path]:
