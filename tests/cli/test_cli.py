@@ -196,6 +196,14 @@ def test_interrupted_command_without_results(command: str, small: Path, message:
     message(error, "interrupted")
 
 
+def test_second_signal_ends_the_process(message: Messages) -> None:
+    listening = "import signal; from taichi_msm.system.process import Interruption; Interruption().listen()"
+    program = f"{listening}; signal.raise_signal(signal.SIGTERM); signal.raise_signal(signal.SIGINT)"
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=False)
+    assert done.returncode == 128 + signal.SIGINT
+    message(done.stderr, "twice")
+
+
 def test_ignored_signals_stay_ignored() -> None:
     """A shell's background ignores SIGINT, and nohup SIGHUP."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
