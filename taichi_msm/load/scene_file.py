@@ -35,15 +35,11 @@ PICTURE_KEYS = (IMAGE_KEY, *MAP_KEYS)
 # Keys of a camera whose values are paths of files.
 CAMERA_FILE_KEYS = ("calibration", "poses")
 
+# Kind of a scene file and its required keys, for `read_file`.
+SCENE = "scene", "sheet, tissue or springs, and time"
+
 # Limit of the lines of an error, as a broken file may have tens of thousands of problems.
 MAX_LINES = 100
-
-
-class FileKind(NamedTuple):
-    """Kind of a YAML file: its name and its required keys, for messages."""
-
-    name: str  # such as "scene"
-    needs: str  # list of the required keys
 
 
 class ParsedFile(NamedTuple):
@@ -52,9 +48,6 @@ class ParsedFile(NamedTuple):
     name: str  # path of the file, for messages
     folder: Path  # to which paths in the file are relative
     document: Document
-
-
-SCENE_KIND = FileKind("scene", "sheet, tissue or springs, and time")
 
 
 def load_scene(
@@ -94,7 +87,7 @@ def load_plan(
         raise ArgumentError("path: a mapping; take the path of a scene file, or build Scene(**mapping)")
     require_type(path, str | Path, "path", "the path of a scene file")
     require_type(image, str | Path | None, "image", "the path of a picture or None")
-    return plan_file(read_file(str(path), SCENE_KIND), overrides, image)
+    return plan_file(read_file(str(path), *SCENE), overrides, image)
 
 
 def plan_file(
@@ -310,41 +303,41 @@ def is_below(path: Path, folder: Path) -> bool:
         return True
 
 
-def read_file(name: str, kind: FileKind) -> ParsedFile:
-    """Read and parse a YAML file of an expected kind, which must contain a mapping."""
+def read_file(name: str, kind: str, needs: str) -> ParsedFile:
+    """Read and parse a YAML file, which must contain a mapping; `kind` and `needs`, its keys, are for messages."""
     try:
         document = read_yaml(_read_text(name, kind))
     except UnreadableError as error:
         raise SceneError([f"{name}:{error.mark.line}:{error.mark.column}: {error}"]) from None
     if document.data is None:
-        raise SceneError([f"{name}:1:1: no keys; a {kind.name} needs at least {kind.needs}"])
+        raise SceneError([f"{name}:1:1: no keys; a {kind} needs at least {needs}"])
     if not isinstance(document.data, dict):
-        message = f"{format_value(document.data)} is not a {kind.name}; expected keys such as {kind.needs}"
+        message = f"{format_value(document.data)} is not a {kind}; expected keys such as {needs}"
         raise SceneError([f"{name}:1:1: {message}"])
     return ParsedFile(name, Path(name).parent, document)
 
 
-def _read_text(name: str, kind: FileKind) -> str:
+def _read_text(name: str, kind: str) -> str:
     path = Path(name)
     try:
         if irregular := irregular_kind(path):
-            raise SceneError([f"{name}: {irregular}; name a {kind.name} file"])
+            raise SceneError([f"{name}: {irregular}; name a {kind} file"])
         with path.open("rb") as file:
             raw = file.read(MAX_BYTES + 1).removeprefix(codecs.BOM_UTF8)
     except ValueError:
-        raise SceneError([f"{name}: not a path; name a {kind.name} file"]) from None
+        raise SceneError([f"{name}: not a path; name a {kind} file"]) from None
     except OSError as error:
         scenes = path.parent.glob("*.y*ml") if isinstance(error, FileNotFoundError) else ()
         hint = next((f"; did you mean '{scene}'?" for scene in scenes if scene.stem == path.stem), "")
         raise SceneError([f"{name}: {(error.strerror or str(error)).lower()}{hint}"]) from None
     if len(raw) > MAX_BYTES:
-        raise SceneError([f"{name}: larger than {MAX_BYTES // 2**20} MiB; a {kind.name} is smaller"])
+        raise SceneError([f"{name}: larger than {MAX_BYTES // 2**20} MiB; a {kind} is smaller"])
     try:
         return raw.decode()
     except UnicodeDecodeError as error:
         if path.suffix.lower() in PICTURE_SUFFIXES:
-            hint = " file, and pass the picture with --image" if kind is SCENE_KIND else ""
-            raise SceneError([f"{name}: a picture; name a {kind.name}{hint}"]) from None
+            hint = " file, and pass the picture with --image" if kind == "scene" else ""
+            raise SceneError([f"{name}: a picture; name a {kind}{hint}"]) from None
         valid = raw[: error.start].decode()
         mark = mark_at(valid, len(valid))
         raise SceneError([f"{name}:{mark.line}:{mark.column}: not UTF-8; save the file as UTF-8"]) from None

@@ -251,7 +251,7 @@ class Sweep:
 
 def load_sweep(path: str | Path) -> Sweep:
     """Read and check a sweep file; raise a SceneError with a line for each error, in the order of the file."""
-    draft = scene_file.Draft(scene_file.read_file(str(path), scene_file.FileKind("sweep", "scene and vary")))
+    draft = scene_file.Draft(scene_file.read_file(str(path), "sweep", "scene and vary"))
     if "sheet" in draft.data and not {"vary", "variables"} & draft.data.keys():
         raise SceneError([f"{path}:1:1: a scene; use `taichi-msm run`, or name it by `scene:` in a sweep file"])
     sweep, problems = _check(draft.data, Path(path).parent)
@@ -288,7 +288,7 @@ def _check(data: dict[str, Any], folder: Path) -> tuple[Sweep | None, list[Probl
         problems += _relocate(vary, fixed, folder, path.parent)
         try:
             # A name without folder, as errors of runs must not depend on the current directory.
-            file = scene_file.read_file(_normalise(path), scene_file.SCENE_KIND)._replace(name=path.name)
+            file = scene_file.read_file(_normalise(path), *scene_file.SCENE)._replace(name=path.name)
             problems += _unknown_keys(file, vary, fixed)
         except SceneError as error:
             problems.append(Problem(("scene",), error.lines[0]))

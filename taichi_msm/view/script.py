@@ -11,7 +11,7 @@ from pydantic import Field, field_validator, model_validator
 
 from taichi_msm.errors import FilesError, Problem, SceneError, writing
 from taichi_msm.load.check import parse_model
-from taichi_msm.load.scene_file import Draft, FileKind, read_file
+from taichi_msm.load.scene_file import Draft, read_file
 from taichi_msm.scene.section import MAX_PIXELS, NotNegative, Number, Pixels, Section, key, scene_fault
 from taichi_msm.view.events import KEYS, Drag, Event, Key, Press, Release, Strength, Turn
 from taichi_msm.view.recording import Film
@@ -96,7 +96,7 @@ class Script(Section):
 
 def load_script(path: str | Path, size: tuple[int, int]) -> Script:
     """Read and check a script for a picture of a width and height [px], in which all presses must be."""
-    draft = Draft(read_file(str(path), FileKind("script", "events")))
+    draft = Draft(read_file(str(path), "script", "events"))
     script, problems = parse_model(Script, draft.data)
     draft.report(problems)
     draft.report(_outside(script, script.size or size) if script is not None else ())

@@ -10,6 +10,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable
+from contextlib import closing
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -286,7 +287,7 @@ def test_remaining_time_within_a_frame(
 ) -> None:
     now = 0.0
     monkeypatch.setattr(time, "monotonic", lambda: now)
-    with console.ProgressDisplay(quiet=False) as progress, console.ProgressDisplay(quiet=True) as silent:
+    with closing(console.ProgressDisplay(False)) as progress, closing(console.ProgressDisplay(True)) as silent:
         for now, frame in ((0, 1), (11, 1), (50, 2), (51, 2), (61, 2), (250, 2)):  # noqa: B007
             progress.update("frames", frame, 4)
             silent.update("frames", frame, 4)
