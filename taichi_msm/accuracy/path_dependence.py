@@ -130,9 +130,8 @@ def second_solution(plan: Plan, frame: int, device: Device, cores: int | None, p
         return None
     probes = tuple(_load_at_once(plan, probe, frame) for probe in scene.probes)
     time = scene.time.model_copy(update={"duration": 1.0, "frames_per_second": 1})
-    sheet = build_solver(
-        plan_variant(plan, scene.model_copy(update={"probes": probes, "time": time})), device, cores=cores
-    )
+    variant = plan_variant(plan, scene.model_copy(update={"probes": probes, "time": time}))
+    sheet = build_solver(variant, device, cores=cores)
     try:
         sheet.advance(1, pause)
         return sheet.displacement()

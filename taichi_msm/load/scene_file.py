@@ -42,6 +42,10 @@ SCENE = "scene", "sheet, tissue or springs, and time"
 MAX_LINES = 100
 
 
+# Replacements of values of a file, as texts "KEY=VALUE" or by key.
+Overrides = Sequence[str] | Mapping[str, Any]
+
+
 class ParsedFile(NamedTuple):
     """Parsed YAML file, a mapping, whose keys are not validated."""
 
@@ -50,9 +54,7 @@ class ParsedFile(NamedTuple):
     document: Document
 
 
-def load_scene(
-    path: str | Path, overrides: Sequence[str] | Mapping[str, Any] = (), image: str | Path | None = None
-) -> Scene:
+def load_scene(path: str | Path, overrides: Overrides = (), image: str | Path | None = None) -> Scene:
     """Read and validate a scene file.
 
     Args:
@@ -79,9 +81,7 @@ def load_scene(
     return load_plan(path, overrides, image).scene
 
 
-def load_plan(
-    path: str | Path, overrides: Sequence[str] | Mapping[str, Any] = (), image: str | Path | None = None
-) -> Plan:
+def load_plan(path: str | Path, overrides: Overrides = (), image: str | Path | None = None) -> Plan:
     """Read and validate a scene file as `load_scene`, and plan the scene for a CPU."""
     if isinstance(path, Mapping):
         raise ArgumentError("path: a mapping; take the path of a scene file, or build Scene(**mapping)")
@@ -90,9 +90,7 @@ def load_plan(
     return plan_file(read_file(str(path), *SCENE), overrides, image)
 
 
-def plan_file(
-    file: ParsedFile, overrides: Sequence[str] | Mapping[str, Any] = (), image: str | Path | None = None
-) -> Plan:
+def plan_file(file: ParsedFile, overrides: Overrides = (), image: str | Path | None = None) -> Plan:
     """Validate a parsed scene file as `load_scene`, and plan the scene for a CPU, with the SHA-256 of camera files."""
     if isinstance(overrides, str) or not (
         isinstance(overrides, (Sequence, Mapping)) and all(isinstance(item, str) for item in overrides)

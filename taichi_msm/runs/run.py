@@ -480,9 +480,8 @@ def _pixels_per_metre(scene: Scene) -> float | None:
     """Return the image scale at the centre of the sheet [px/m]; None without pictures or if it is out of view."""
     if not scene.renders:
         return None
-    centre, right, up = view_at(scene, 0.0, next(iter(scene.render.all_cameras))).pixels(
-        np.array([[0.0, 0, 0], [1e-4, 0, 0], [0, 1e-4, 0]])
-    )
+    points = np.array([[0.0, 0, 0], [1e-4, 0, 0], [0, 1e-4, 0]])
+    centre, right, up = view_at(scene, 0.0, next(iter(scene.render.all_cameras))).pixels(points)
     scale = float(max(np.linalg.norm(right - centre), np.linalg.norm(up - centre))) / 1e-4
     return scale if math.isfinite(scale) else None
 
