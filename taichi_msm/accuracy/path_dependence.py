@@ -41,11 +41,9 @@ class PathDependence:
 
     def __init__(self, plan: Plan) -> None:
         self._plan = plan
-        self._loads = [
-            (FrameLoad(probe, plan.scene.sheet), max(abs(percent) for _, percent in probe.load) or 1.0)
-            for probe in plan.scene.probes
-            if not probe.moved
-        ]
+        pushing = [probe for probe in plan.scene.probes if not probe.moved]
+        peaks = [max(abs(percent) for _, percent in probe.load) or 1.0 for probe in pushing]
+        self._loads = [(FrameLoad(probe, plan.scene.sheet), peak) for probe, peak in zip(pushing, peaks, strict=True)]
         # Frames, as a pair of number and displacements: the previous one, the one with the largest displacement, and
         # the first one after that with less than half of it.
         self._previous: tuple[int, Array] | None = None

@@ -100,9 +100,7 @@ def plan_file(file: ParsedFile, overrides: Overrides = (), image: str | Path | N
     if "scene" in draft.data and {"vary", "variables"} & draft.data.keys():
         raise SceneError([f"{file.name}:1:1: a sweep; use `taichi-msm sweep`"])
     parsed = (
-        starmap(_build_override, overrides.items())
-        if isinstance(overrides, Mapping)
-        else map(parse_override, overrides)
+        starmap(_to_override, overrides.items()) if isinstance(overrides, Mapping) else map(parse_override, overrides)
     )
     for override in parsed:
         draft.override(override)
@@ -161,7 +159,7 @@ def parse_override(text: str) -> Override:
     return Override(name, path, document.data, faults)
 
 
-def _build_override(key: str, value: Any) -> Override:
+def _to_override(key: str, value: Any) -> Override:
     path = parse_key(key)
     name = f"override {truncate(key)}"
     if not path:
