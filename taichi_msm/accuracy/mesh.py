@@ -29,7 +29,7 @@ With `springs`, a sheet with another mesh is a different sheet, so its error is 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import lru_cache, partial
 from itertools import product
@@ -145,17 +145,14 @@ def _with_equal_force(probe: Probe, sheet: Sheet, coarse: Sheet) -> Probe:
     return probe.with_force(force / coarse_force)
 
 
-def _sampling_force_error(scene: Scene) -> float:
+def _sampling_force_error(probes: Sequence[Probe], sheet: Sheet) -> float:
     """Return the largest relative difference between a tool's force on the mesh and on a much finer mesh."""
     # The force of a tool is summed over at most 4 million mass points.
-    refinement = min(8, math.isqrt(4_000_000 // math.prod(scene.sheet.points)))
+    refinement = min(8, math.isqrt(4_000_000 // math.prod(sheet.points)))
     if refinement < 2:
         return 0.0  # With cells this small, no tool is as narrow as a cell.
-    probes = [probe for probe in scene.probes if probe.total is not None]
-    pairs = [
-        (sum_probe_forces(probe, scene.sheet)[0], sum_probe_forces(probe, scene.sheet, refinement)[0])
-        for probe in probes
-    ]
+    pushing = [probe for probe in probes if probe.total is not None]
+    pairs = [(sum_probe_forces(probe, sheet)[0], sum_probe_forces(probe, sheet, refinement)[0]) for probe in pushing]
     return max((abs(force / fine_force - 1) for force, fine_force in pairs if fine_force > 0), default=0.0)
 
 
@@ -184,7 +181,7 @@ class MeshCompanion:
         # Cells of the run per cell of the first companion run, along a side.
         self._ratio = min((count - 1) / (fewer - 1) for count, fewer in points)
         self._differences = [0.0 for _ in plans]
-        self._sampling_error = _sampling_force_error(plan.scene)
+        self._sampling_error = _sampling_force_error(plan.scene.probes, plan.scene.sheet)
         self._contact, self._grips = plan.has_contact, any(tool.grips for tool in plan.tools)
         cell = rest_of(plan.scene.sheet).longest_side
         narrow = [tool for tool in solid_tools(plan.tools).values() if tool.radius < MIN_RADIUS_CELLS * cell]

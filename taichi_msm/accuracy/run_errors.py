@@ -216,9 +216,8 @@ def run_warnings(
     scene, grid = plan.scene, plan.grid
     time_step, reason, mesh, force = errors
     if time_step is not None or mesh is not None:
-        yield _error_line(time_step, mesh, progress.max_displacement, scale) + (
-            "; mesh error unknown: another number of points is another sheet" if scene.tissue is None else ""
-        )
+        unknown = "; mesh error unknown: another number of points is another sheet" if scene.tissue is None else ""
+        yield _error_line(time_step, mesh, progress.max_displacement, scale) + unknown
     if time_step is not None:
         if REMEDY_THRESHOLD < time_step.error < math.inf and not time_step.separate:
             yield "--estimate-error separates the errors of the time step and of rounding"

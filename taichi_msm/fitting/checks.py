@@ -47,18 +47,14 @@ def faults_at_start(
     observed_motion = float(np.interp(times * rate, np.arange(len(initial.motion)), initial.motion).max())
     if observed_motion < 0.1 * motion:
         moving = np.flatnonzero(initial.motion > 0.5 * motion) / rate
-        yield (
-            f"{name}: its {len(observations[0].time)} times miss the motion: "
-            f"the scene's points then move by {1000 * observed_motion:.3g} of {1000 * motion:.3g} mm; "
-            f"add times between {moving[0]:g} and {moving[-1]:g} s"
-        )
+        fault = f"the scene's points then move by {1000 * observed_motion:.3g} of {1000 * motion:.3g} mm"
+        remedy = f"add times between {moving[0]:g} and {moving[-1]:g} s"
+        yield f"{name}: its {len(observations[0].time)} times miss the motion: {fault}; {remedy}"
         return
     same_camera = not any(parameter.key.startswith("render.") for parameter in parameters)
-    messages = [
-        fault
-        for observed, predicted in zip(observations, initial.values, strict=True)
-        for fault in observed.faults_at_start(scene, predicted, same_camera=same_camera)
-    ]
+    messages: list[str] = []
+    for observed, predicted in zip(observations, initial.values, strict=True):
+        messages += observed.faults_at_start(scene, predicted, same_camera=same_camera)
     yield from messages
     if not messages and all(parameter.is_log for parameter in parameters):
         yield from opposed(observations, scene, initial)

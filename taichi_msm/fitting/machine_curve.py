@@ -17,7 +17,7 @@ with G, share_i, phi_i and memory s_i as in `terms/viscoelasticity.py`.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import replace
 from typing import NamedTuple
@@ -25,7 +25,7 @@ from typing import NamedTuple
 import numpy as np
 
 from taichi_msm.errors import DivergedError, SceneError, StageProgressCallback
-from taichi_msm.fitting.least_squares import Misfit, Scales, Search, Solution
+from taichi_msm.fitting.least_squares import Misfit, Search, Solution
 from taichi_msm.fitting.machine_model import MachineModel, MachineProblem
 from taichi_msm.fitting.observation import Array
 from taichi_msm.fitting.parameters import with_values
@@ -180,9 +180,8 @@ class CurveRuns(Runs):
         low, high = self.problem.limits
         # A parameter without effect does not move, which shrinks its region to 0.
         region = np.maximum(region, 1e-6)
-        margin = np.array(
-            [CONTACT_MARGIN * self._tangent.reach / (parameter.scale or 1) for parameter in self.problem.parameters]
-        )
+        scales = np.array([parameter.scale or 1 for parameter in self.problem.parameters])
+        margin = CONTACT_MARGIN * self._tangent.reach / scales
         below = np.where(self._is_contact, np.minimum(region, margin), region)
         return np.maximum(low, x - below), np.minimum(high, x + region)
 
@@ -224,11 +223,9 @@ class CurveRuns(Runs):
         # Too large shares are scaled down: an error instead would be a wall that the search cannot leave.
         scale = min(1.0, MAX_SHARES / max(sum(share for share, _ in branches), NO_SHARE))
         branches = [(scale * share, time) for share, time in branches]
-        forces_of_tests = [
-            relax(curve(loading.travel(values.get(key))), branches, 1 / loading.rate)
-            for loading, key in zip(self.problem.tests, self.problem.contact_keys, strict=True)
-        ]
-        return Prediction((np.concatenate(forces_of_tests)[:, None] + self._correction,), 1, np.zeros(1))
+        pairs = zip(self.problem.tests, self.problem.contact_keys, strict=True)
+        of_tests = [relax(curve(test.travel(values.get(key))), branches, 1 / test.rate) for test, key in pairs]
+        return Prediction((np.concatenate(of_tests)[:, None] + self._correction,), 1, np.zeros(1))
 
     def _forces(self, values: dict[str, float], reach: float, halvings: int = 0) -> Array:
         """Return the forces of a curve at equidistant travels [N], shape (TRAVELS + 1,), with a cache."""
@@ -262,7 +259,7 @@ def search_by_curve(runs: CurveRuns, misfit: Misfit, start: Array, initial: Pred
     starts = []
     if not search.fits_well(solution):
         predictions = ((x, runs.predict_coarse(x, 0)) for x in search.alternative_starts())
-        starts = _two_best(predictions, misfit, solution.scales)
+        starts = misfit.two_best(predictions, solution.scales)
     # A parameter with an effect below 3 sigma per unit of x, such as a lock beyond the measured range, may fit better
     # at a smaller value.
     effect = np.linalg.norm(misfit.scaled(search.jacobian(solution), solution.scales), axis=0)
@@ -294,7 +291,7 @@ def _descend(runs: CurveRuns, misfit: Misfit, start: Array, *, by_tests: bool) -
 
     def evaluate(x: Array) -> Solution:
         predicted = runs.run_tests(x) if by_tests else runs.run_curve(x)
-        return Solution(x, predicted, scales, misfit.cost(misfit.residuals(predicted, scales)), converged=False)
+        return Solution(x, predicted, scales, misfit.total(predicted, scales), converged=False)
 
     def is_converged(cost: float, previous: float) -> bool:
         # A third of a standard deviation of a parameter changes the cost by 0.05.
@@ -340,14 +337,4 @@ def _relaxation_starts(runs: CurveRuns, misfit: Misfit, current: Solution, limit
     low, high = (np.clip(limit[free], current.x[free] - max_log, current.x[free] + max_log) for limit in limits)
     starts = np.tile(current.x, (64, 1))
     starts[:, free] = low + qmc.Sobol(len(free), seed=1).random(64) * (high - low)
-    return _two_best(((x, runs.predict_one(x)) for x in starts), misfit, current.scales)
-
-
-def _two_best(predictions: Iterable[tuple[Array, Prediction | None]], misfit: Misfit, scales: Scales) -> list[Array]:
-    """Return the two coordinates of lowest cost; None is the prediction of a failed run."""
-    costs = [
-        (misfit.cost(misfit.residuals(predicted, scales)), x.tolist())
-        for x, predicted in predictions
-        if predicted is not None
-    ]
-    return [np.array(x) for _, x in sorted(costs)[:2]]
+    return misfit.two_best(((x, runs.predict_one(x)) for x in starts), current.scales)

@@ -12,7 +12,7 @@ from copy import deepcopy
 from dataclasses import dataclass
 from numbers import Integral, Real
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 from typing_extensions import TypedDict
 
@@ -226,6 +226,16 @@ class Method(TypedDict, total=False):
     window: tuple[float, float] | None
     rate: float | None
     contact: Sequence[float] | None
+
+
+class Request(NamedTuple):
+    """Arguments of `fit` but the observed data, as documented there."""
+
+    scene: Scene
+    free: Sequence[str]
+    bounds: Mapping[str, Bounds]
+    forces: tuple[str | Path, float] | None
+    method: Method
 
 
 def require_types(observed: Any, free: Any, method: Mapping[str, Any], **others: Any) -> None:

@@ -42,6 +42,14 @@ class Profile(NamedTuple):
     high: float | None  # upper end, likewise
 
 
+def quadratic_profile(x: float, deviation: float, quantile: float) -> Profile:
+    """Return the quadratic approximation of a profile at x; `quantile`: half width of its interval [deviations]."""
+    # The limit bounds the plotted range of unidentified parameters.
+    step = min(deviation, 3.0)
+    points = [ProfilePoint(x + offset * step, offset) for offset in np.linspace(-3, 3, 25).tolist()]
+    return Profile(points, x - quantile * deviation, x + quantile * deviation)
+
+
 class Profiler:
     """Profile likelihood of a solution's parameters."""
 

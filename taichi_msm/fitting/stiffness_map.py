@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -13,7 +13,7 @@ from taichi_msm.accuracy.mesh import coarser_plan
 from taichi_msm.errors import SceneError, StageProgressCallback
 from taichi_msm.fitting.checks import faults, faults_at_start
 from taichi_msm.fitting.observation import Array
-from taichi_msm.fitting.parameters import Bounds, Parameter, make_parameters, rounded
+from taichi_msm.fitting.parameters import Bounds, Parameter, Request, make_parameters, rounded
 from taichi_msm.fitting.points import PointModel, PointObservation
 from taichi_msm.fitting.predict import Prediction, mesh_error, without_outputs
 from taichi_msm.fitting.profiles import ProfilePoint
@@ -49,10 +49,10 @@ class MapSettings:
     force: Parameter | None  # component of a force, whose fitted factor scales all forces; None for fixed forces
 
 
-def map_settings(
-    scene: Scene, free: Sequence[str], bounds: Mapping[str, Bounds], resolution: int | None
-) -> MapSettings | None:
+def map_settings(request: Request) -> MapSettings | None:
     """Return the settings of a map, or None for a fit of numbers; raise a SceneError if they are invalid."""
+    (scene, free, bounds, _, method) = request
+    resolution = method.get("resolution")
     if KEY not in free:
         if resolution is not None:
             raise SceneError([f"--resolution {resolution}: only for a map; add --free {KEY}"])
@@ -121,9 +121,9 @@ def fit_map(
     if (coarse_plan := coarser_plan(plan)) is not None:
         coarse_factors = MapGrid(settings.resolution, _cells(coarse_plan)).factors(start[:cell_count])
         coarse_model = PointModel(coarse_plan.scene, observations, coarse_plan.grid.frames + 1)
-        coarse_points = coarse_model.points(Adjoint(coarse_plan, device).run(coarse_factors, report_progress))
+        coarse_points = coarse_model.on_sheet(Adjoint(coarse_plan, device).run(coarse_factors, report_progress))
         # Richardson extrapolation of order 2, from half the cells per side.
-        differences = (coarse_model.observe(coarse_points) - initial)[observations.known] / 3.0
+        differences = (coarse_model.predict(coarse_points) - initial)[observations.known] / 3.0
         mesh_shift = float(np.sqrt(np.nanmean(differences**2)))
     sigma = math.hypot(observations.sigma, mesh_shift)
     force_limits = settings.force.limits if settings.force else None

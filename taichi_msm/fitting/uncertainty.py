@@ -180,15 +180,11 @@ def unidentified_groups(
     groups = [members[labels == label] for label in range(count)]
     pairs = zip(parameters, x.tolist(), uncertainties.deviations.tolist(), strict=True)
     errors = np.array([parameter.relative_error(coordinate, deviation) for parameter, coordinate, deviation in pairs])
-    return [
-        _describe_group(
-            [parameters[n] for n in group],
-            float(errors[group].max()),
-            list(_known_combinations(parameters, uncertainties, group, directions[group])),
-            "" if forces else ", or give a force (--forces)",
-        )
-        for group in groups
-    ]
+    described, remedy = [], "" if forces else ", or give a force (--forces)"
+    for group in groups:
+        known = list(_known_combinations(parameters, uncertainties, group, directions[group]))
+        described.append(_describe_group([parameters[n] for n in group], float(errors[group].max()), known, remedy))
+    return described
 
 
 def _known_combinations(

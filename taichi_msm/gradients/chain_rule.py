@@ -117,10 +117,8 @@ def _coefficient_gradient(plan: Plan, gradient: SheetGradient) -> Array:
         for by_spring, share, tension in zip(gradient.springs, unit, tensions, strict=True)
     ]
     derivatives = [*springs, float(tensions @ (material.across, material.down, material.shear))]
-    derivatives += [
-        _from_logarithm(float(gradient.foundation.sum()), material.virtual),
-        _from_logarithm(gradient.bending, material.bending),
-    ]
+    derivatives.append(_from_logarithm(float(gradient.foundation.sum()), material.virtual))
+    derivatives.append(_from_logarithm(gradient.bending, material.bending))
     laws = (material.stiffening, gradient.stiffening), (material.virtual_stiffening, gradient.foundation_stiffening)
     for law, by_numbers in laws:
         if law:

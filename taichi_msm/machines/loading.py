@@ -90,9 +90,8 @@ def find_approach(scene: Scene) -> Approach:
     for solid in solids.values():
         start, tip_height = _first_contact(solid, direction, scene), float(solid.path[0, 2] - solid.heights[0])
     if start is None:
-        raise SceneError(
-            [f"{key}: the line from its first to its farthest key misses the sheet; direct it at the sheet"]
-        )
+        fault = "the line from its first to its farthest key misses the sheet; direct it at the sheet"
+        raise SceneError([f"{key}: {fault}"])
     return Approach(tool.probe, start, direction, tip_height, scene.sheet.size, is_clamp=not solids)
 
 
@@ -172,9 +171,9 @@ def build_loading(
     if contact is None:
         contact = float(test.depth[0 if is_clamp else _contact_row(test, noise, peak)])
     if test.depth[peak] <= contact:
+        fall = f"the depth falls from {contact:.4g} to {test.depth[peak]:.4g} m"
         fault = (
-            f"the depth falls from {contact:.4g} to {test.depth[peak]:.4g} m while the force rises to "
-            f"{test.force[peak]:.4g} N: is its sign opposite to the motion of the tool?"
+            f"{fall} while the force rises to {test.force[peak]:.4g} N: is its sign opposite to the motion of the tool?"
         )
         raise SceneError([f"{test.name}: {fault} Choose another depth by --columns, or change its sign"])
     if rate is None and scene.time.at_rest and not (scene.tissue and scene.tissue.relaxation):
@@ -251,9 +250,8 @@ def _sample_in_depth(test: MachineTest, noise: float, contact: float, *, finds_c
         # The force of a ball rises with the cube of the depth or less, and exceeds the noise first at the contact.
         late = min((CONTACT_NOISES * noise / float(test.force[:last].max())) ** (1 / 3), MAX_CONTACT_SHARE)
         share += late / (1 - late)
-    depth = np.linspace(
-        max(contact - share * (deepest - contact), float(test.depth[:last].min())), deepest, DEPTH_FRAMES + 1
-    )
+    start = max(contact - share * (deepest - contact), float(test.depth[:last].min()))
+    depth = np.linspace(start, deepest, DEPTH_FRAMES + 1)
     half, order = 0.5 * (depth[1] - depth[0]), np.argsort(test.depth[:last], kind="stable")
     pressed = replace(test, time=test.time[order], depth=test.depth[order], force=test.force[order])
     frames = _means(pressed.depth, depth, half, pressed)

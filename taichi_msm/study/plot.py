@@ -35,7 +35,7 @@ from taichi_msm.plot_style import (
     VERMILION,
 )
 from taichi_msm.study.format import ErrorMeasurement, format_number, machine_summary
-from taichi_msm.study.result import DrawingMeasurement, Study
+from taichi_msm.study.result import DrawingMeasurement, Measurement, Study
 from taichi_msm.system.compiler import compiler_label
 
 # Colours encode the damping difference, dashes and markers the precision.
@@ -193,11 +193,7 @@ def _plot_meshes(axes: Axes, study: Study) -> None:
 
 
 def _plot_times(
-    axes: Axes,
-    x: Sequence[float],
-    points: Sequence[ErrorMeasurement | DrawingMeasurement],
-    line: dict[str, Any],
-    scale: float = 1,
+    axes: Axes, x: Sequence[float], points: Sequence[Measurement], line: dict[str, Any], scale: float = 1
 ) -> None:
     """Plot a line through the medians of the times, and thin bars from the fastest to the slowest time."""
     times = [point.seconds for point in points]
@@ -206,7 +202,7 @@ def _plot_times(
     axes.vlines(x, fastest, slowest, color=line["color"], linewidth=0.7, alpha=0.6)
 
 
-def _extremes(points: Iterable[ErrorMeasurement | DrawingMeasurement]) -> Iterator[float]:
+def _extremes(points: Iterable[Measurement]) -> Iterator[float]:
     for point in points:
         yield from (point.seconds.fastest, point.seconds.slowest)
 

@@ -62,9 +62,8 @@ class Compiler:
 
     def folder(self) -> Path:
         """Return the directory of compiled kernels."""
-        return Path(
-            os.environ.get(self.folder_variable) or Path.home() / f".cache/{self.name}/{self.prefix.lower()}cache"
-        )
+        default = f".cache/{self.name}/{self.prefix.lower()}cache"
+        return Path(os.environ.get(self.folder_variable) or Path.home() / default)
 
     def load(self) -> Any:
         """Import the compiler, without its banner on stdout and its check for a newer version."""

@@ -16,6 +16,7 @@ from taichi_msm.errors import SceneError, printable
 from taichi_msm.load.check import parse_model
 from taichi_msm.load.scene_file import MAX_LINES, load_scene, parse_override, schema
 from taichi_msm.scene.scene import Scene
+from taichi_msm.scene.sheet import Sheet
 from tests.golden import Messages
 from tests.scenes import random_contact, random_scene, random_tissue
 
@@ -450,3 +451,11 @@ def test_schema_rejects_invalid_scenes(validator: jsonschema.Draft202012Validato
         assert not validator.is_valid(good | invalid), invalid
     for key in ("sheet", "springs", "time"):
         assert not validator.is_valid({name: value for name, value in good.items() if name != key})
+
+
+def test_surface_whose_file_was_read_stays_valid(root: Path) -> None:
+    # Sections that hold it validate it again.
+    sheet = load_scene(root / "scenes" / "kidney.yaml").sheet
+    assert sheet.surface is not None
+    assert sheet.surface.file is not None
+    assert Sheet(points=(2, 2), size=(1, 1), surface=sheet.surface).surface is sheet.surface
