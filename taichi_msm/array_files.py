@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 from taichi_msm.images import PictureError, actual_path
 from taichi_msm.system.files import read_regular
+from taichi_msm.system.process import available_memory
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -22,6 +23,10 @@ MAX_M = 1e6
 
 # Largest file, and largest array in it [bytes]: 4096 x 4096 points of three float64 numbers, with some margin.
 MAX_BYTES = 2**29
+
+
+# Peak memory of reading a file, in sizes of its array.
+MEMORY_FACTOR = 4
 
 
 @dataclass(frozen=True, eq=False)
@@ -50,7 +55,9 @@ def read_array_file(
     remedy = f"with numpy.save, save an array of numbers of shape {shapes}"
     try:
         array = _load(path, data, names)
-    except (ValueError, OSError, EOFError, MemoryError, zipfile.BadZipFile, NotImplementedError, RuntimeError):
+    except PictureError:
+        raise
+    except Exception:  # a forged file may raise any type
         raise PictureError(f"{path} is not an .npy or .npz file of numbers", remedy) from None
     if array.dtype.kind not in "fiu":
         raise PictureError(f"{path} has an array of {array.dtype}", remedy)
@@ -73,22 +80,32 @@ def smallest_step(values: NDArray[Any]) -> float:
     return float(steps.min()) if len(steps) else 0.0
 
 
+def _require_memory(path: str, size: int) -> None:
+    """Raise a PictureError if an array of a size [bytes] needs more memory than is free."""
+    needed, free = MEMORY_FACTOR * size, available_memory()
+    if needed > free:
+        fault = f"{path} needs {needed / 2**20:.3g} MiB of memory, and {free / 2**20:.3g} MiB is free"
+        raise PictureError(fault, "save fewer points")
+
+
 def _load(path: str, data: bytes, names: Sequence[str]) -> NDArray[Any]:
     """Return the array of a file's content."""
     import numpy as np
 
     if data[:2] != b"PK":
+        _require_memory(path, len(data))
         array: NDArray[Any] = np.load(io.BytesIO(data), allow_pickle=False)
         return array
     with zipfile.ZipFile(io.BytesIO(data)) as archive:
         members = {info.filename.removesuffix(".npy"): info for info in archive.infolist()}
         name = next((name for name in names if name in members), next(iter(members)) if len(members) == 1 else None)
         if name is None:
-            raise PictureError(
-                f"{path} has {', '.join(sorted(members)[:9]) or 'no array'}", f"name one of its arrays {names[0]}"
-            )
-        if members[name].file_size > MAX_BYTES:
-            raise PictureError(f"{path}: {name} has {members[name].file_size:,} bytes", f"take at most {MAX_BYTES:,}")
+            present = ", ".join(sorted(members)[:9]) or "no array"
+            raise PictureError(f"{path} has {present}", f"name one of its arrays {names[0]}")
+        size = members[name].file_size
+        if size > MAX_BYTES:
+            raise PictureError(f"{path}: {name} has {size:,} bytes", f"take at most {MAX_BYTES:,}")
+        _require_memory(path, size)
         with archive.open(members[name]) as member:
             array = np.load(io.BytesIO(member.read(MAX_BYTES)), allow_pickle=False)
     return array
