@@ -10,7 +10,7 @@ import numpy as np
 from taichi_msm.accuracy.contact_warnings import first_piercing_probe
 from taichi_msm.model.loads import LoadBounds
 from taichi_msm.model.plan import Plan
-from taichi_msm.model.rest import rest_of
+from taichi_msm.model.rest import heights, rest_of
 from taichi_msm.solver.state import LargestDisplacement, Reading, RunProgress, largest_displacement
 from taichi_msm.terms import TERMS
 from taichi_msm.terms.foundation import FoundationTerm, foundation_energy, point_shares
@@ -94,6 +94,7 @@ class DivergenceMonitor:
             if not pierced_by:
                 pierced_by = first_piercing_probe(self._plan, reading.displacement, frame)
                 pierced_frame = frame if pierced_by else 0
+            height = heights(reading.displacement, self._plan.scene.sheet)
             self.progress = RunProgress(
                 frame=frame,
                 max_displacement=max(progress.max_displacement, extreme.distance),
@@ -104,8 +105,8 @@ class DivergenceMonitor:
                 longest_spring=max(progress.longest_spring, reading.longest_spring),
                 energy=reading.energy,
                 reach=extreme.reach,
-                deepest=max(progress.deepest, -float(reading.displacement[..., 2].min())),
-                highest=max(progress.highest, float(reading.displacement[..., 2].max())),
+                deepest=max(progress.deepest, -float(height.min())),
+                highest=max(progress.highest, float(height.max())),
                 peak=max(progress.peak, reading.energy),
                 residual=max(progress.residual, reading.residual),
                 evaluations=progress.evaluations + reading.evaluations,

@@ -4,7 +4,7 @@ A sheet that buckles or wrinkles has several equilibria under one load. Two chec
 
 - Jump: relative to the change of the loads, the sheet moves much farther between two frames than between the frames
   before and after them.
-- Second solution: the sheet reaches another equilibrium if all loads of a frame act at once on the flat sheet, and
+- Second solution: the sheet reaches another equilibrium if all loads of a frame act at once on the sheet at rest, and
   tools move straight to their positions. This also detects different shapes in loading and unloading.
 """
 
@@ -73,10 +73,10 @@ class PathDependence:
 
     def _load_change(self, frame: int) -> float:
         """Return the relative change of loads and tools since the previous frame; 0 if a grip begins or ends."""
-        change, rate, size = 0.0, self._plan.grid.frames_per_second, rest_of(self._plan.scene.sheet).extent
+        change, rate, rest = 0.0, self._plan.grid.frames_per_second, rest_of(self._plan.scene.sheet)
         for load, peak in self._loads:
             (before, start), (after, end) = (load.at(each, rate) for each in (frame - 1, frame))
-            change += abs(after - before) / peak + float(np.linalg.norm(end - start)) / size
+            change += abs(after - before) / peak + math.dist(*rest.place(np.stack([start, end]))) / rest.extent
         for tool in self._plan.tools:
             grips = [grip_frames(grip, rate) for grip in tool.grips]
             if any((frame in grip) != (frame - 1 in grip) for grip in grips):

@@ -137,9 +137,8 @@ class PointObservation(Observation):
 
     def rest_positions(self, scene: Scene) -> Array:
         """Return the rest positions of the points [m], shape (N, 3)."""
-        height, width = scene.sheet.size
-        across, down = self.coordinates.T
-        return np.stack([(across - 0.5) * width, (0.5 - down) * height, np.zeros_like(across)], axis=1)
+        rest = rest_of(scene.sheet)
+        return rest.place(rest.coordinates(self.coordinates))
 
     def at_rest(self, scene: Scene) -> Array:
         """Return the values of the sheet at rest, shape (N, T, 3 or 2)."""
@@ -160,7 +159,7 @@ class PointObservation(Observation):
             panels.append(partial(plot_match, fitted=x, observed=y, unit=self.unit, origin="the mean"))
         if np.sum(self.is_observed.any(axis=1)) > 1:
             residuals = np.sqrt(np.nanmean((fitted - self.values) ** 2, axis=(1, 2)))
-            on_sheet = partial(plot_on_sheet, coordinates=self.coordinates, size=scene.sheet.size)
+            on_sheet = partial(plot_on_sheet, coordinates=self.coordinates, size=rest_of(scene.sheet).sides)
             panels.append(partial(on_sheet, residuals=residuals, unit=self.unit))
         return panels
 

@@ -22,8 +22,9 @@ import numpy as np
 from taichi_msm.errors import SceneError
 from taichi_msm.machines.reader import Array, MachineTest
 from taichi_msm.model.rest import rest_of
-from taichi_msm.model.tools import SolidTool, build_tools, solid_tools
+from taichi_msm.model.tools import SolidTool, Tool, build_tools
 from taichi_msm.scene.scene import Scene
+from taichi_msm.scene.sheet import Sheet
 
 # Default frames per second, and largest number of frames at this default.
 FRAMES_PER_SECOND, MAX_FRAMES = 10.0, 200
@@ -36,6 +37,9 @@ NORMAL_FACTOR = 1.48
 
 # Smallest force in contact, in units of the noise.
 CONTACT_NOISES = 5.0
+
+# Spacing of the points of a curved sheet at the first contact, in radii of the tool: within 1e-3 of a radius.
+MAX_SPACING_RADII = 1 / 16
 
 # Share of the travel that frames begin before the contact; largest share at an estimated contact.
 CONTACT_SHARE, MAX_CONTACT_SHARE = 0.05, 0.5
@@ -54,21 +58,24 @@ class Approach:
     probe: int  # index of the tool in the scene
     start: Array  # centre of the tip at first contact [m], shape (3,); 0, the displacement at rest, for a clamp
     direction: Array  # unit vector of the motion, shape (3,)
-    tip_height: float  # height of the centre above the lowest point of the tip [m]
-    size: tuple[float, float]  # height and width of the sheet [m]
-    is_clamp: bool
+    tool: Tool
+    sheet: Sheet
+
+    @property
+    def is_clamp(self) -> bool:
+        """Whether the tool is a clamp."""
+        return not isinstance(self.tool, SolidTool)
 
     def place(self, data: dict[str, Any], travel: Array, rate: float) -> dict[str, Any]:
         """Return a scene's data with the path, duration and frame rate of a test.
 
         `travel`: distance from `start` at every frame [m], shape (frames,).
         """
-        (height, width), time = self.size, np.arange(len(travel)) / rate
-        x, y, z = (self.start + travel[:, None] * self.direction).T
+        time, centres = np.arange(len(travel)) / rate, self.start + travel[:, None] * self.direction
         # Keyframes are [t, across, down, height], and those of a clamp [t, x, y, z].
-        places = (x, y, z) if self.is_clamp else (x / width + 0.5, 0.5 - y / height, z - self.tip_height)
+        keys = self.tool.keys_at(centres, self.sheet) if isinstance(self.tool, SolidTool) else centres
         probes = list(data["probes"])
-        probes[self.probe] = {**probes[self.probe], "path": np.stack([time, *places], axis=1).tolist()}
+        probes[self.probe] = {**probes[self.probe], "path": np.column_stack([time, keys]).tolist()}
         times = {**data["time"], "duration": (len(travel) - 1) / rate, "frames_per_second": rate}
         return {**data, "probes": probes, "time": times}
 
@@ -86,26 +93,26 @@ def find_approach(scene: Scene) -> Approach:
         raise SceneError([f"{key}: does not move; add a key in the direction of the test"])
     direction = farthest / np.linalg.norm(farthest)
     start: Array | None = np.zeros(3)
-    solids, tip_height = solid_tools(tools), 0.0
-    for solid in solids.values():
-        start, tip_height = _first_contact(solid, direction, scene), float(solid.path[0, 2] - solid.heights[0])
+    if isinstance(tool, SolidTool):
+        start = _first_contact(tool, direction, scene.sheet)
     if start is None:
         fault = "the line from its first to its farthest key misses the sheet; direct it at the sheet"
         raise SceneError([f"{key}: {fault}"])
-    return Approach(tool.probe, start, direction, tip_height, scene.sheet.size, is_clamp=not solids)
+    return Approach(tool.probe, start, direction, tool, scene.sheet)
 
 
-def _first_contact(tool: SolidTool, direction: Array, scene: Scene) -> Array | None:
+def _first_contact(tool: SolidTool, direction: Array, sheet: Sheet) -> Array | None:
     """Return the centre of the tip at first contact [m], shape (3,), or None if the tool misses the sheet."""
     start, tolerance = tool.path[0], 1e-9 * tool.radius
-    travel, reach = 0.0, float(np.linalg.norm(start)) + tool.length + math.hypot(*scene.sheet.size)
+    rest, travel = rest_of(sheet), 0.0
+    reach = float(np.linalg.norm(start - rest.box.mean(axis=0))) + tool.length + rest.diagonal
+    refine = math.ceil(rest.longest_side / (MAX_SPACING_RADII * tool.radius)) - 1
     # Sphere tracing: the tool advances by its gap to the sheet. The gap of a tilted plate is approximate, so the tool
     # may have to go back.
-    goes_back, tip_height = False, tool.path[0, 2] - tool.heights[0]
+    goes_back = False
     for _ in range(1000):
         centre = start + travel * direction
-        placed = replace(tool, times=np.zeros(1), path=centre[None], heights=centre[2:] - tip_height)
-        gap = placed.gap(scene.sheet)
+        gap = tool.gap_at(centre, sheet, refine)
         if abs(gap) <= tolerance or (goes_back and gap > 0):
             return np.asarray(centre)
         goes_back = goes_back or gap < 0

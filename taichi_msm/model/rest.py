@@ -78,6 +78,11 @@ class Rest(ABC):
     def place(self, coordinates: Array) -> Array:
         """Return the positions of places [m], shape (n, 3), for coordinates of shape (n, 2)."""
 
+    def refined(self, refine: int) -> Array:
+        """Return points of the sheet [m], shape (n, 3), with `refine` between neighbouring mass points."""
+        across, down = (np.linspace(0, 1, (count - 1) * (refine + 1) + 1) for count in self.position.shape[1::-1])
+        return self.place(self.coordinates(np.stack(np.meshgrid(across, down), axis=-1).reshape(-1, 2)))
+
     @abstractmethod
     def normals(self, coordinates: Array) -> Array:
         """Return the unit normals at places, shape (n, 3), for coordinates of shape (n, 2)."""
@@ -233,6 +238,12 @@ def rest_normals(sheet: Sheet) -> Array:
     """Return the unit normals at the mass points at rest, shape (rows, cols, 3)."""
     rest = rest_of(sheet)
     return rest.point_normals if isinstance(rest, CurvedRest) else np.tile([0.0, 0.0, 1.0], (*sheet.points, 1))
+
+
+def heights(displacement: NDArray[Any], sheet: Sheet) -> NDArray[Any]:
+    """Return the components of displacements, shape (rows, cols, 3), along the normals at rest [m]."""
+    rest = rest_of(sheet)
+    return (displacement * rest.point_normals).sum(axis=-1) if isinstance(rest, CurvedRest) else displacement[..., 2]
 
 
 class _Surface:

@@ -159,12 +159,21 @@ class SolidTool(Tool):
 
     def gap(self, sheet: Sheet, t: float = 0.0) -> float:
         """Return the distance at a time [s] from the sheet at rest [m], negative inside the sheet."""
+        return self.gap_at(self.path_at(np.array([t]))[0], sheet)
+
+    def gap_at(self, centre: Array, sheet: Sheet, refine: int = 0) -> float:
+        """Return the gap with c at a place [m], on a curved sheet from points, `refine` between mass points."""
         if sheet.surface:
-            r = rest_of(sheet).position.reshape(-1, 3) - self.path_at(np.array([t]))[0]
+            r = rest_of(sheet).refined(refine) - centre
             depth, *_ = self.shape.build_depth(NUMPY)(*r.T, *self.axis, self.length, self.radius)
             return -float(depth.max())
         half = np.array([sheet.size[1] / 2, sheet.size[0] / 2, 0.0])
-        return self.shape.gap(self.path_at(np.array([t]))[0], self.axis, self.length, self.radius, half)
+        return self.shape.gap(centre, self.axis, self.length, self.radius, half)
+
+    def keys_at(self, centres: Array, sheet: Sheet) -> Array:
+        """Return across, down and height [m] of keyframes with c at places [m], shape (n, 3) each."""
+        heights = centres[:, 2:] - (self.path[0, 2] - self.heights[0])
+        return np.concatenate([rest_of(sheet).fractions(centres[:, :2]), heights], axis=1)
 
     def reaches(self, scene: Scene) -> bool:
         """Return whether the tool meets the sheet at rest at any frame or keyframe."""
@@ -241,6 +250,19 @@ class FollowingTool(SolidTool):
 
     def direction_at(self, t: float) -> Array:
         return self._follow(np.array([t]))[1][0]
+
+    def keys_at(self, centres: Array, sheet: Sheet) -> Array:  # noqa: ARG002
+        from scipy.optimize import root
+
+        size, keys = self.rest.extent, [np.array([*self.places[0], self.heights[0] / self.rest.extent])]
+
+        def distance(key: Array, centre: Array) -> Array:
+            placed = replace(self, times=np.zeros(1), places=key[None, :2], heights=size * key[2:])
+            return np.asarray((placed.path_at(np.zeros(1))[0] - centre) / size)
+
+        for centre in centres:
+            keys.append(root(distance, keys[-1], centre, tol=1e-14).x)
+        return np.array(keys[1:]) * (1, 1, size)
 
     def _follow(self, t: Array) -> tuple[Array, Array, Array]:
         """Return X [m] and N, shape (n, 3) each, and the height [m], shape (n,)."""

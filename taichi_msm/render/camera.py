@@ -369,7 +369,7 @@ def pinhole(scene: Scene, time: float = 0.0) -> Camera:
     distance = scene.render.size[1] / 2 / _top_scale(scene) / math.tan(math.radians(OBLIQUE_FOV) / 2)
     lower, upper = rest_of(scene.sheet).box.tolist()
     x, y = ((a + b) / 2 for a, b in zip(lower[:2], upper[:2], strict=True))
-    return Camera(eye=(x, y, upper[2] + distance), target=(x, y, upper[2]), fov=OBLIQUE_FOV)
+    return Camera(eye=(x, y, upper[2] + distance), target=(x, y, float(_middle(scene)[2])), fov=OBLIQUE_FOV)
 
 
 def frozen_camera(camera: Camera, time: float) -> Camera:

@@ -9,11 +9,14 @@ from numpy.typing import NDArray
 
 from taichi_msm.lenses import MODELS
 from taichi_msm.model.rest import rest_of
+from taichi_msm.model.tool_force import control_points
 from taichi_msm.render import texture
 from taichi_msm.render.camera import View, is_moving, pair_transform, view_at
 from taichi_msm.scene.camera import Camera, Distortion
 from taichi_msm.scene.render import Light
 from taichi_msm.scene.scene import Scene
+from taichi_msm.scene.sheet import Sheet
+from taichi_msm.scene.tools import Probe
 
 
 def drawing_warnings(scene: Scene) -> Iterator[str]:
@@ -31,16 +34,28 @@ def drawing_warnings(scene: Scene) -> Iterator[str]:
     for index, probe in enumerate(scene.probes):
         if (instrument := probe.instrument) is None:
             continue
-        if instrument.shaft[2] < 0:
+        normals = _normals_on_path(probe, scene.sheet)
+        if (pierced := np.flatnonzero(normals @ instrument.shaft < 0)).size:
+            normal = ", ".join(f"{component:.3g}" for component in normals[pierced[0]] + 0.0)
+            is_flat = scene.sheet.surface is None
+            side = "with z above 0" if is_flat else f"less than 90 degrees from the normal there, [{normal}]"
             yield (
                 f"probes.{index}.instrument: its shaft points down, through the sheet at rest; take the direction "
-                "from the tip to the hand, with z above 0"
+                f"from the tip to the hand, {side}"
             )
         if instrument.outer_radius > 0.25 * rest_of(scene.sheet).extent:
             yield (
                 f"probes.{index}.instrument: {instrument.outer_radius:g} m is a wide instrument for a sheet of "
                 f"{rest_of(scene.sheet).extent:g} m; the radius is in metres"
             )
+
+
+def _normals_on_path(probe: Probe, sheet: Sheet) -> NDArray[np.float64]:
+    """Return the unit normals at rest at the keyframes of a tool's place, shape (n, 3)."""
+    rest = rest_of(sheet)
+    if probe.path is None:
+        return rest.normals(control_points(probe, sheet)[1])
+    return rest.normals(rest.coordinates(np.array(probe.path, dtype=float)[:, 1:3]))
 
 
 def describe_cameras(scene: Scene) -> Iterator[str]:

@@ -5,7 +5,9 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from taichi_msm.model.rest import rest_of
 from taichi_msm.render.camera import View
+from taichi_msm.scene.sheet import Sheet
 
 # Number of cells that are processed at a time, to bound the memory.
 CELLS_PER_BATCH = 1024
@@ -37,8 +39,23 @@ def pick(position: NDArray[np.floating], refine: int, view: View, pixel: Pair) -
     return column / (cols - 1), row / (rows - 1)
 
 
+def pick_at_rest(sheet: Sheet, refine: int, view: View, pixel: Pair) -> Pair | None:
+    """Return the place (across, down) of the sheet at rest that a pixel shows; None without one.
+
+    The plane of a flat sheet continues beyond its edges.
+    """
+    rest = rest_of(sheet)
+    if not rest.is_flat:
+        return pick(rest.position, refine, view, pixel)
+    point = intersect_rest_plane(view, pixel)
+    if point is None:
+        return None
+    across, down = rest.fractions(point).tolist()
+    return across, down
+
+
 def intersect_rest_plane(view: View, pixel: Pair) -> NDArray[np.floating] | None:
-    """Return x and y [m] of the point of the sheet's plane at rest that a pixel shows; None without one."""
+    """Return x and y [m] of the point of a flat sheet's plane at rest that a pixel shows; None without one."""
     matrix = view.centred_at(pixel).matrix
     planar = matrix[:2, :2]
     # Outside of a lens's image the matrix is NaN.

@@ -62,8 +62,9 @@ class RunProgress:
     longest_spring: float = 1.0  # as in a `Reading`, at any frame so far
     energy: float = 0.0  # as in a `Reading`, at this frame [J]
     reach: float = 0.0  # Euclidean norm of the displacements of all mass points at this frame [m]
-    deepest: float = 0.0  # largest depth of a mass point below its rest position at any frame so far [m]
-    highest: float = 0.0  # largest height of a mass point above its rest position at any frame so far [m]
+    # Largest depth and height of a mass point at any frame so far, along its normal at rest [m].
+    deepest: float = 0.0
+    highest: float = 0.0
     peak: float = 0.0  # largest energy at any frame so far [J]
     residual: float = 0.0  # as in a `Reading`, the largest of all frames so far
     evaluations: int = 0  # as in a `Reading`, the sum over all frames so far

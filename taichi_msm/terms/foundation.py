@@ -21,7 +21,7 @@ from taichi_msm.laws import law_of
 from taichi_msm.laws.law import Law, LawNumbers
 from taichi_msm.model.loads import Schedule
 from taichi_msm.model.plan import Plan
-from taichi_msm.model.rest import rest_normals, rest_of
+from taichi_msm.model.rest import heights, rest_normals, rest_of
 from taichi_msm.model.sheet import Material
 from taichi_msm.scene.scene import Scene
 from taichi_msm.scene.sheet import Sheet
@@ -237,7 +237,7 @@ def foundation_energy(plan: Plan, k: Array | float, displacement: Array) -> floa
     """Return the energy of a foundation of the stiffness k [N/m], a number or shape (rows, cols) [J]."""
     square, law = (displacement**2).sum(axis=-1), plan.material.virtual_stiffening
     if law is not None:
-        along = (displacement * rest_normals(plan.scene.sheet)).sum(axis=-1)
+        along = heights(displacement, plan.scene.sheet)
         scale, depth, *shape = law.constants(1.0)
         square += depth**2 * law.law.build(NUMPY).integral(-along * scale, *shape) - along**2
     return float((k * square).sum()) / 2

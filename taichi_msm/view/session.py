@@ -19,9 +19,9 @@ from taichi_msm.load.yaml_reader import MAX_NODES
 from taichi_msm.model.plan import Plan
 from taichi_msm.model.rest import rest_of
 from taichi_msm.model.surface import place_instrument, place_instruments, surface_point
-from taichi_msm.model.tool_force import probe_force
+from taichi_msm.model.tool_force import probe_directions
 from taichi_msm.model.tools import path_problems, path_warnings
-from taichi_msm.render.picking import intersect_rest_plane
+from taichi_msm.render.picking import pick_at_rest
 from taichi_msm.render.texture import load_texture
 from taichi_msm.runs.media import Picture
 from taichi_msm.runs.simulation import Simulation
@@ -119,8 +119,8 @@ class Session(AbstractContextManager["Session"]):
         self.viewport = Viewport(self._simulation.renderer, play=play)
         self._pointer = (0.0, 0.0)
         self._hover_pixel: tuple[float, float] | None = None
-        # Start of a drag: position of the tool, and point of the rest plane under the pointer [m].
-        self._drag_start: tuple[SheetPosition, NDArray[np.floating] | None] | None = None
+        # Start of a drag: position of the tool, and that of the sheet at rest under the pointer.
+        self._drag_start: tuple[SheetPosition, SheetPosition | None] | None = None
         self._draw()
 
     def _reset_status(self) -> None:
@@ -139,11 +139,11 @@ class Session(AbstractContextManager["Session"]):
 
     def displacement(self) -> float:
         """Return the displacement of the tissue at the tool [m]."""
-        return float(np.linalg.norm(self._touched_point() - [*self._rest_point(self.tool.position), 0.0]))
+        return float(np.linalg.norm(self._motion_at_tool()))
 
     def depth(self) -> float:
         """Return the depth of the tissue at the tool, below the sheet at rest [m]; negative above it."""
-        return -float(self._touched_point()[2])
+        return -float(self._motion_at_tool() @ self._normal())
 
     def tool_force(self) -> float:
         """Return the force between tool and tissue in the last frame [N]."""
@@ -283,23 +283,32 @@ class Session(AbstractContextManager["Session"]):
         instruments = place_instruments(scene, positions, self._simulation.time)
         instrument = scene.probes[-1].instrument
         if instrument is not None and (position := self._hover_position()):
-            instruments[-1] = place_instrument(instrument, scene, positions, self._rest_point(position))
+            instruments[-1] = place_instrument(instrument, scene, positions, self._coordinates(position))
         return self.viewport.draw(positions, instruments)
 
-    def _rest_point(self, position: SheetPosition) -> NDArray[np.float64]:
-        (across, down), (height, width) = position, self.scene.sheet.size
-        return np.array([(across - 0.5) * width, (0.5 - down) * height])
+    def _coordinates(self, position: SheetPosition) -> NDArray[np.float64]:
+        """Return the coordinates at rest of a position, see `Rest`, shape (2,)."""
+        return rest_of(self.scene.sheet).coordinates(np.array(position))
 
     def _touched_point(self) -> NDArray[np.float64]:
         """Return the point of the sheet at which the tool acts [m], shape (3,)."""
-        rest = self._rest_point(self.tool.position)
-        return surface_point(self.positions(), self.scene.render.refine, self.scene.sheet, rest)[0]
+        at = self._coordinates(self.tool.position)
+        return surface_point(self.positions(), self.scene.render.refine, self.scene.sheet, at)[0]
+
+    def _motion_at_tool(self) -> NDArray[np.float64]:
+        """Return the displacement of the point at which the tool acts [m], shape (3,)."""
+        at = self._coordinates(self.tool.position)
+        return self._touched_point() - rest_of(self.scene.sheet).place(at[None])[0]
+
+    def _normal(self) -> NDArray[np.float64]:
+        """Return the unit normal of the sheet at rest at the tool, shape (3,)."""
+        return rest_of(self.scene.sheet).normals(self._coordinates(self.tool.position)[None])[0]
 
     def _press(self, x: float, y: float, direction: int) -> None:
         """Press the tissue at a pixel; with direction -1 instead of 1, pull or grip it.
 
         A force-controlled tool acts at the material point that is visible there, a position-controlled one at the point
-        of the rest plane.
+        of the sheet at rest.
         """
         position = self._simulation.pick((x, y), self.viewport.view)
         if position is None:
@@ -309,27 +318,25 @@ class Session(AbstractContextManager["Session"]):
             position = self._rest_position(x, y) or self.tool.target
         self.tool.press(position, direction)
         self._pointer = x, y
-        self._drag_start = position, intersect_rest_plane(self.viewport.view, self._pointer)
+        self._drag_start = position, self._rest_position(x, y)
         self._notice_until = 0
 
     def _drag(self, x: float, y: float) -> None:
-        """Move the pressing tool by the displacement of the pointer on the rest plane.
+        """Move the pressing tool by the displacement of the pointer on the sheet at rest.
 
         On the deformed sheet, which moves with the tool, there would be feedback.
         """
         if self._drag_start is None:
             return
         self._pointer = x, y
-        ((across, down), start), end = self._drag_start, intersect_rest_plane(self.viewport.view, self._pointer)
-        if start is None or end is None:
-            return
-        (right, up), (height, width) = end - start, self.scene.sheet.size
-        self.tool.move((across + right / width, down - up / height))
+        ((across, down), start), end = self._drag_start, self._rest_position(x, y)
+        if start is not None and end is not None:
+            self.tool.move((across + (end[0] - start[0]), down + (end[1] - start[1])))
 
     def _rebase_drag(self) -> None:
         """Restart a drag at the current position of the tool, after the camera has moved."""
         if self._drag_start is not None:
-            self._drag_start = self.tool.target, intersect_rest_plane(self.viewport.view, self._pointer)
+            self._drag_start = self.tool.target, self._rest_position(*self._pointer)
 
     def _forget_pointer(self) -> None:
         self._drag_start = self._hover_pixel = None
@@ -341,11 +348,8 @@ class Session(AbstractContextManager["Session"]):
         return None if self._hover_pixel is None else self._simulation.pick(self._hover_pixel, self.viewport.view)
 
     def _rest_position(self, x: float, y: float) -> SheetPosition | None:
-        """Return the position on the rest plane at a pixel; None if the plane is not visible there."""
-        if (point := intersect_rest_plane(self.viewport.view, (x, y))) is None:
-            return None
-        height, width = self.scene.sheet.size
-        return float(point[0]) / width + 0.5, 0.5 - float(point[1]) / height
+        """Return the position on the sheet at rest at a pixel; None if it is not visible there."""
+        return pick_at_rest(self.scene.sheet, self.scene.render.refine, self.viewport.view, (x, y))
 
     def _handle_key(self, key: str) -> None:
         match key:
@@ -456,7 +460,9 @@ class Session(AbstractContextManager["Session"]):
         """Whether the tool pulls, by its direction or the sign of the probe's force."""
         if not isinstance(self.tool, ForceControlledTool):
             return False
-        return self.tool.percent * probe_force(self.tool.probe, self.scene.sheet).force[2] > 0
+        at = self._coordinates(self.tool.position)
+        (force,) = probe_directions(self.tool.probe, self.scene.sheet, at[None])
+        return bool(self.tool.percent * (force @ self._normal()) > 0)
 
     def _reading_lines(self) -> list[str]:
         speed = f"steps {1 / self.frame_rate / self._frame_time_s:.2g} x real time" if self._frame_time_s > 0 else ""

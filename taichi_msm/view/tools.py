@@ -5,13 +5,11 @@ from __future__ import annotations
 import math
 from collections import deque
 from collections.abc import Sequence
-from dataclasses import replace
 from itertools import product
 from typing import Any
 
-import numpy as np
-
 from taichi_msm.model.plan import Plan
+from taichi_msm.model.rest import rest_of
 from taichi_msm.model.tool_force import control_points
 from taichi_msm.model.tools import SolidTool, build_tools, overlap, solid_tools
 from taichi_msm.scene.scene import Scene
@@ -51,13 +49,16 @@ def clear_start(probe: Probe, scene_probes: Sequence[Probe], scene: Scene) -> Sh
 def _capsule(probe: Probe, sheet: Sheet) -> SolidTool:
     """Build a capsule with the motion of a probe's instrument; a force-controlled one stays on the sheet at rest."""
     assert probe.instrument is not None
-    capsule = probe.instrument.model_copy(update={"radius": probe.instrument.outer_radius, "plate": None})
-    tools = build_tools([Probe(path=probe.path or ((0.0, *CENTRE, 0.0),), instrument=capsule)], sheet)
-    (tool,) = solid_tools(tools).values()
-    if probe.path is None:
+    capsule, path = (
+        probe.instrument.model_copy(update={"radius": probe.instrument.outer_radius, "plate": None}),
+        probe.path,
+    )
+    if path is None:
         times, points = control_points(probe, sheet)
-        heights = np.full(len(times), tool.path[0, 2])
-        tool = replace(tool, times=times, path=np.column_stack([points, heights]))
+        path = tuple((time, *at, 0.0) for time, at in zip(times, rest_of(sheet).fractions(points), strict=True))
+    # A copy, because control points may jump.
+    moved = Probe(path=((0.0, *CENTRE, 0.0),), instrument=capsule).model_copy(update={"path": path})
+    (tool,) = solid_tools(build_tools([moved], sheet)).values()
     return tool
 
 
@@ -204,8 +205,8 @@ class PositionControlledTool:
     def __init__(self, probe: Probe, plan: Plan, start: SheetPosition = CENTRE) -> None:
         assert probe.instrument is not None
         self.grid, self._sheet, self._radius = plan.grid, plan.scene.sheet, probe.instrument.outer_radius
-        self._stride = SHAPES[probe.instrument.shape].max_stride * self._radius
-        self._max_depth = min(MAX_DEPTH_RADII * self._radius, 0.25 * min(self._sheet.size))
+        self._max_stride = SHAPES[probe.instrument.shape].max_stride * self._radius
+        self._max_depth = min(MAX_DEPTH_RADII * self._radius, 0.25 * min(rest_of(self._sheet).sides))
         self._start, self._hover_height = start, _hover_height(probe.instrument)
         friction = probe.friction if "friction" in probe.model_fields_set else DEFAULT_FRICTION
         if plan.scene.time.at_rest and friction != "rough":
@@ -265,7 +266,7 @@ class PositionControlledTool:
             self._grip_start = None
         elif self._grip_requested and self._grip_start is None and self.height == self._target_height:
             self._grip_start = begin
-        self._move_tip()
+        self._move_tip(begin, end)
         key = end, *self.position, self.height
         _append_keyframe(self._path, key)
         # An active grip has no end yet: take one after any session.
@@ -281,21 +282,24 @@ class PositionControlledTool:
     def _target_height(self) -> float:
         return _round_height(0.0 - self.depth) if self.engaged else self._hover_height
 
-    def _move_tip(self) -> None:
-        """Move the tip towards its target, by at most the distance that a frame permits."""
+    def _move_tip(self, begin: float, end: float) -> None:
+        """Move the tip towards its target between two times [s], by at most the stride of its shape per step."""
         max_rise = (HOVER_HEIGHT_RADII * self._radius + self._max_depth) / (RISE_TIME_S * self.grid.frames_per_second)
         rise = self._target_height - self.height
         goal = self._target_height if abs(rise) <= max_rise else self.height + math.copysign(max_rise, rise)
-        (across, down), (to_across, to_down), (height, width) = self.position, self.target, self._sheet.size
-        distance = math.hypot((to_across - across) * width, (to_down - down) * height, goal - self.height)
-        # The margin of 2 % allows for rounded positions.
-        max_distance = 0.98 * self._stride * self.grid.steps_per_frame
-        fraction = min(1.0, max_distance / distance) if distance > 0 else 1.0
-        if fraction < 1:
-            self.position = on_sheet((across + fraction * (to_across - across), down + fraction * (to_down - down)))
-            self.height = _round_height(self.height + fraction * (goal - self.height))
-        else:
-            self.position, self.height = self.target, _round_height(goal)
+        start, (across, down), (to_across, to_down) = (begin, *self.position, self.height), self.position, self.target
+        fraction, position, height = 1.0, self.target, _round_height(goal)
+        while (stride := self._stride(start, (end, *position, height))) > self._max_stride:
+            # The margin of 2 % allows for rounded positions.
+            fraction *= 0.98 * self._max_stride / stride
+            position = on_sheet((across + fraction * (to_across - across), down + fraction * (to_down - down)))
+            height = _round_height(self.height + fraction * (goal - self.height))
+        self.position, self.height = position, height
+
+    def _stride(self, *path: tuple[float, float, float, float]) -> float:
+        """Return the largest displacement of the tip in a step of a path [m]."""
+        (tool,) = build_tools([self._probe.model_copy(update={"path": path})], self._sheet)
+        return tool.max_stride(self.grid.step)[0]
 
     def _time(self, frame: int) -> float:
         """Return the time of a frame [s], bit-identical to its step, so that the tip is exactly at the keyframe."""

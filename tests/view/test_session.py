@@ -552,7 +552,7 @@ def test_position_control_follows_the_pointer_and_measures_forces(begin: Begin) 
     assert session.felt_force() > 1.2 * pressed
     x_before = session.positions()[8, 8, 0]
     for _ in range(10):
-        x, y = session.viewport.project(np.array([*session._rest_point(session.tool.target), 0])) or (0, 0)
+        x, y = session.viewport.project(np.array([*session._coordinates(session.tool.target), 0])) or (0, 0)
         session.handle(Drag(x + 1, y))
         advance(session, 1)
     assert session.positions()[8, 8, 0] > x_before + 0.001, "friction moves the tissue"
