@@ -35,7 +35,7 @@ class ArrayFile:
 
     values: NDArray[Any]  # float64
     sha256: str  # of the file
-    step: float  # smallest difference of two values [m]; 0 for floating-point numbers
+    step: float  # the values are multiples of it, but for an offset [m]; 0 for floating-point numbers
 
 
 def read_array_file(
@@ -69,15 +69,14 @@ def read_array_file(
     if not is_small.all():
         at = ", ".join(map(str, np.unravel_index(int((~is_small).argmax()), array.shape)))
         raise PictureError(f"{path}: [{at}] is {array[~is_small][0]}", f"give finite numbers, of up to {MAX_M:g} m")
-    return ArrayFile(values, hashlib.sha256(data).hexdigest(), unit * smallest_step(array))
+    return ArrayFile(values, hashlib.sha256(data).hexdigest(), unit * quantum(array))
 
 
-def smallest_step(values: NDArray[Any]) -> float:
-    """Return the smallest difference of two integers; 0 for floating-point numbers, and if all are equal."""
+def quantum(values: NDArray[Any]) -> float:
+    """Return the greatest common divisor of the differences of integers; 0 for equal and floating-point numbers."""
     import numpy as np
 
-    steps = np.diff(np.unique(values.astype(float))) if values.dtype.kind in "iu" else np.empty(0)
-    return float(steps.min()) if len(steps) else 0.0
+    return float(np.gcd.reduce(np.diff(np.unique(values).astype(np.int64)))) if values.dtype.kind in "iu" else 0.0
 
 
 def _require_memory(path: str, size: int) -> None:
