@@ -38,7 +38,7 @@ class SurfaceRecord(TypedDict):
 
     kind: str
     sha256: str | None  # of the file
-    sides: list[float]  # shortest and longest mean side of a cell [m]
+    sides: list[float]  # shortest and longest side of a cell [m]
     isotropy_error: IsotropyRecord
     clamped: int  # number of cells with a spring whose stiffness would be negative
     filled: float  # share of pixels without depth

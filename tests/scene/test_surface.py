@@ -229,7 +229,7 @@ def test_steep_heights(write: Callable[..., Path], message: Messages) -> None:
     with message.raises(SceneError, "s.yaml:5:6: sheet.surface.height: "):
         load_scene(write("{height: {file: z.npy, unit: mm}}"))
     # The sides of cells are almost parallel.
-    with pytest.raises(SceneError, match="sheet.surface.height: .*less steep"):
+    with pytest.raises(SceneError, match=r"sheet\.surface\.height: .*less steep"):
         load_scene("s.yaml", {"sheet.surface.height.unit": "m"})
 
 
