@@ -9,6 +9,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import jsonschema
 import numpy as np
 import pytest
 from numpy.typing import NDArray
@@ -18,7 +19,7 @@ from taichi_msm import array_files
 from taichi_msm.accuracy.surface import describe_surface, surface_notes, surface_record
 from taichi_msm.errors import SceneError
 from taichi_msm.load.cost import estimate_budget
-from taichi_msm.load.scene_file import load_plan, load_scene
+from taichi_msm.load.scene_file import load_plan, load_scene, schema
 from taichi_msm.scene.scene import Scene
 from taichi_msm.scene.sheet import Sheet
 from tests.golden import Messages
@@ -284,6 +285,18 @@ def test_records(write: Callable[..., Path]) -> None:
         surface_record(Scene(**{**load_scene("s.yaml").model_dump(), "sheet": {"points": (3, 3), "size": (1, 1)}}))
         is None
     )
+
+
+def test_schema() -> None:
+    """Exactly one kind; surfaces of points need neither size nor number of points."""
+    described = schema()
+    validator = jsonschema.Draft202012Validator({"$ref": "#/$defs/Sheet", "$defs": described["$defs"]})
+    flat: dict[str, Any] = {"points": [9, 11], "size": [0.3, 0.4]}
+    tube, points = {"tube": {"radius": 0.1}}, {"points": {"file": "p.npy", "unit": "mm"}}
+    for sheet in (flat, flat | {"surface": tube}, {"surface": points}):
+        assert validator.is_valid(sheet)
+    for sheet in ({"points": [9, 11]}, {}, flat | {"surface": {}}, flat | {"surface": tube | points}):
+        assert not validator.is_valid(sheet)
 
 
 def test_memory_of_a_file(write: Callable[..., Path]) -> None:
