@@ -23,14 +23,14 @@ COUNTS = (9, 17, 33, 65)
 def main() -> None:
     """Compute the errors, print them, and draw them."""
     errors = {
-        "tube of rhombi under pressure, closed form": [pressurised(*slanted_tube(n), -1) for n in COUNTS],
-        "spherical cap under pressure, closed form": [pressurised(*conformal_cap(n), 1) for n in COUNTS],
+        "tube of rhombi under pressure, closed form": np.array([pressurised(*slanted_tube(n), -1) for n in COUNTS]),
+        "spherical cap under pressure, closed form": np.array([pressurised(*conformal_cap(n), 1) for n in COUNTS]),
         "dome pressed off centre on a foundation, finite elements": np.abs(dome_errors(COUNTS)),
     }
     with plt.style.context(STYLE):
         figure, axes = plt.subplots(figsize=(ONE_COLUMN_WIDTH, 3.4), layout="constrained")
         for (name, values), colour, marker in zip(errors.items(), (BLUE, VERMILION, GREEN), "osD", strict=True):
-            axes.loglog(COUNTS, 100 * np.array(values), color=colour, marker=marker, label=name)
+            axes.loglog(COUNTS, 100 * values, color=colour, marker=marker, label=name)
             print(name, *(f"{100 * value:.3g} %" for value in values), sep=", ")
         square = 100 * errors["spherical cap under pressure, closed form"][0] * (COUNTS[0] / np.array(COUNTS)) ** 2 / 2
         axes.loglog(COUNTS, square, color=SILVER, linestyle="--", label="second order")

@@ -232,8 +232,8 @@ class FollowingTool(SolidTool):
 
     def path_at(self, t: Array) -> Array:
         points, normals, heights = self._follow(t)
-        # `tip_height` of each shape depends on the angle between its axis and N only.
-        tips = [tip_offset(self.shape, self.axis, self.radius, normal) for normal in normals]
+        directions = normals[:1] if self.shape.is_round else normals  # The tip of a round shape has one height.
+        tips = np.array([tip_offset(self.shape, self.axis, self.radius, normal) for normal in directions])
         return points + (heights + tips)[:, None] * normals
 
     @cached_property

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from taichi_msm.model.cells import Cells, isotropy_errors
 from taichi_msm.model.rest import CurvedRest, rest_of
 from taichi_msm.scene.scene import Scene
 from taichi_msm.solver.arrays import SheetLayout
@@ -21,6 +22,7 @@ from taichi_msm.terms import highest_frequency
 from taichi_msm.terms.contact_rest import touched_points
 from taichi_msm.terms.springs import assemble_springs
 from tests import reference
+from tests.reference import surface
 from tests.reference.contact import centre
 from tests.reference.loads import frame_loads
 from tests.reference.sheet import highest_frequency as twin_frequency
@@ -141,3 +143,12 @@ def test_material_matches_twin(case: str) -> None:
         np.testing.assert_allclose(k, own.stiffness, rtol=1e-12)
     frequency = highest_frequency(plan.material, scene.sheet)
     assert frequency == pytest.approx(twin_frequency(scene), rel=1e-12)
+
+
+def test_isotropy_errors_match_twin() -> None:
+    rng, (i, j) = np.random.default_rng(1), np.mgrid[:12, :9]
+    noise = rng.random((3, *i.shape))
+    position = np.stack([j + 0.3 * noise[0], -0.8 * i - 0.2 * noise[1], 0.3 * noise[2]], axis=-1)
+    expected = surface.isotropy_error(surface.cells(position))
+    assert expected.max() > 0.3
+    np.testing.assert_allclose(isotropy_errors(Cells.of(position)), expected, rtol=0, atol=1e-13)
