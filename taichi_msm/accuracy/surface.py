@@ -11,7 +11,13 @@ from typing_extensions import TypedDict
 from taichi_msm.model.cells import cell_stiffness
 from taichi_msm.model.plan import Plan
 from taichi_msm.model.rest import CurvedRest, rest_of
-from taichi_msm.model.surface_checks import describe_place, isotropy_remedy, neighbour_angles
+from taichi_msm.model.surface_checks import (
+    FOLD_REMEDY,
+    describe_fold,
+    describe_largest,
+    isotropy_remedy,
+    neighbour_angles,
+)
 from taichi_msm.scene.scene import Scene
 from taichi_msm.terms import fictitious_masses
 from taichi_msm.terms.elasticity import spring_families
@@ -32,7 +38,7 @@ class SurfaceRecord(TypedDict):
 
     kind: str
     sha256: str | None  # of the file
-    sides: list[float]  # shortest and longest mean side of a cell [m]
+    sides: list[float]  # shortest and longest side of a cell [m]
     isotropy_error: IsotropyRecord
     clamped: int  # number of cells with a spring whose stiffness would be negative
     filled: float  # share of pixels without depth
@@ -62,18 +68,17 @@ def surface_notes(scene: Scene) -> Iterator[str]:
     isotropy, file, side = record["isotropy_error"], surface.file, min(rest.cell_sides)
     if scene.tissue is not None and isotropy["mean"] > NOTED_ISOTROPY_ERROR:
         yield (
-            f"sheet.surface: the springs deviate from isotropic tissue by {isotropy['mean']:.3g} on the mean, up to "
-            f"{isotropy['worst']:.3g}; {isotropy_remedy(rest, surface.kind)}"
+            f"sheet.surface: the springs deviate from isotropic tissue by {isotropy['mean']:.2g} on the mean, up to "
+            f"{isotropy['worst']:.2g}; {isotropy_remedy(rest, surface.kind)}"
         )
     if surface.height and file and file.step > NOTED_STEP * side:
         yield (
             f"sheet.surface: heights in steps of {file.step:.3g} m, over a twentieth of a cell's side, {side:.3g} m; "
-            "take a picture of 16 bits or an array"
+            "take a picture of 16 bits, or an array of floating-point numbers"
         )
     angles = neighbour_angles(rest.cell_normals)
-    if (angle := float(angles.max())) > NOTED_ANGLE_DEGREES:
-        place = describe_place(angles == angle)
-        yield f"sheet.surface: cells at {place} meet at {angle:.0f} degrees; take more points, or a smoother surface"
+    if angles.max() > NOTED_ANGLE_DEGREES:
+        yield f"sheet.surface: {describe_fold(angles)}; {FOLD_REMEDY}"
 
 
 def describe_surface(plan: Plan) -> Iterator[str]:
@@ -93,7 +98,7 @@ def describe_surface(plan: Plan) -> Iterator[str]:
     line = "surface: isotropy error 0"
     # Rectangles and rhombi are exact but for rounding.
     if isotropy["worst"] > 1e-9:
-        worst = describe_place(rest.isotropy_errors == rest.isotropy_errors.max())
+        worst = describe_largest(rest.isotropy_errors)
         line = f"surface: isotropy error {isotropy['mean']:.2g} on the mean, {isotropy['worst']:.2g} at {worst}"
     clamped = record["clamped"]
     count = f"{clamped} cells are" if clamped > 1 else "a cell is"

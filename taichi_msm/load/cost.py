@@ -137,21 +137,23 @@ def estimate_budget(plan: Plan) -> Budget:
     track_bytes = scene.render.tracks**2 * (frames * TRACK_BYTES + 16) + FILE_BYTES if "tracks" in scene.output else 0
     track_bytes *= cameras
     force_rows = frames * len(scene.probes)
+    surface = scene.sheet.surface
+    file_bytes = surface.file.values.nbytes if surface and surface.file else 0
     memory_numbers = len(memory_names(plan))
     numbers = STATE_NUMBERS + OUTPUT_NUMBERS + memory_numbers + sum(MAP_NUMBERS[name] for name in scene.maps)
-    numbers += CURVED_NUMBERS * (scene.sheet.surface is not None)
+    numbers += CURVED_NUMBERS * (surface is not None)
     numbers += sum(not probe.moved for probe in scene.probes)  # the load of each force-controlled tool
     # Companion runs add up to two sheets in f64, and with tissue two smaller ones.
     has_companions = scene.time.tolerance is not None or choose_companion_runs(plan).planned
     bytes_per_number = number_bytes + (8 * (2 + (scene.tissue is not None) * 5 / 16) if has_companions else 0)
     return Budget(
         frames=frames,
-        simulation_bytes=round(points * bytes_per_number * numbers),
+        simulation_bytes=round(points * bytes_per_number * numbers) + file_bytes,
         drawing_bytes=drawing_bytes(scene) if scene.renders else 0,
         track_bytes=track_bytes,
         picture_bytes=math.ceil(frames * frame_bytes),
         trajectory_bytes=position_bytes + 8 * frames + FILE_BYTES if "trajectory" in scene.output else 0,
-        rest_bytes=REST_BYTES * points + FILE_BYTES if scene.sheet.surface else 0,
+        rest_bytes=REST_BYTES * points + FILE_BYTES if surface else 0,
         force_bytes=force_rows * FORCE_ROW_BYTES + FILE_BYTES if "forces" in scene.output else 0,
         record_bytes=2 * len(scene.model_dump_json(indent=2)) + RECORD_BYTES,
         # Two states (the saved one and its replacement), and the positions and forces of all frames.

@@ -23,15 +23,17 @@ from taichi_msm.scene.section import MAX_PATH, format_value
 # Largest size of a file [bytes].
 MAX_BYTES = 2**20
 
-# Keys whose values are paths of pictures, or of arrays of a surface.
+# Keys whose values are paths of pictures.
 IMAGE_KEY: Key = ("image",)
 MAP_KEYS: tuple[Key, ...] = (
     ("tissue", "map", "image"),
     ("tissue", "foundation_map", "image"),
     ("springs", "map", "image"),
 )
+PICTURE_KEYS = (IMAGE_KEY, *MAP_KEYS)
+
+# Keys of the heights and points of a surface, whose values are paths of arrays, of heights also of pictures.
 SURFACE_KEYS: tuple[Key, ...] = (("sheet", "surface", "height", "file"), ("sheet", "surface", "points", "file"))
-PICTURE_KEYS = (IMAGE_KEY, *MAP_KEYS, *SURFACE_KEYS)
 
 # Keys of a camera whose values are paths of files.
 CAMERA_FILE_KEYS = ("calibration", "poses")
@@ -105,7 +107,7 @@ def plan_file(file: ParsedFile, overrides: Overrides = (), image: str | Path | N
     )
     for override in parsed:
         draft.override(override)
-    for key in (*PICTURE_KEYS[image is not None :], *(key for key, _ in camera_files(draft.data))):
+    for key in (*PICTURE_KEYS[image is not None :], *SURFACE_KEYS, *(key for key, _ in camera_files(draft.data))):
         draft.resolve_path(key, file.folder)
     if image is not None:
         draft.override(Override(f"--image {truncate(str(image))}", IMAGE_KEY, str(image)))
@@ -119,7 +121,7 @@ def plan_file(file: ParsedFile, overrides: Overrides = (), image: str | Path | N
 def names_file(key: Key) -> bool:
     """Return whether a text at a key is the path of a file."""
     is_camera = key[:-1] == ("render", "camera") or (key[:2] == ("render", "cameras") and len(key) == 4)
-    return key in PICTURE_KEYS or (is_camera and key[-1] in CAMERA_FILE_KEYS)
+    return key in (*PICTURE_KEYS, *SURFACE_KEYS) or (is_camera and key[-1] in CAMERA_FILE_KEYS)
 
 
 def camera_files(data: Mapping[str, Any]) -> list[tuple[Key, str]]:
@@ -222,11 +224,11 @@ class Draft:
         is_overridden = any(key[:n] in self._overridden for n in range(1, len(key) + 1))
         if not is_overridden and not is_below(folder / path, folder):
             remedy = ", or name it with --image" if key == IMAGE_KEY else ""
-            noun = "the picture" if key in PICTURE_KEYS and key not in SURFACE_KEYS else "it"
+            noun = "the picture" if key in PICTURE_KEYS else "it"
             message = f"{path} is not below the scene's folder; put {noun} there{remedy}"
             self.problems.append((self._origin(key), Problem(key, message)))
             del section[key[-1]]
-        elif key not in PICTURE_KEYS:
+        elif key[-1] in CAMERA_FILE_KEYS:
             # Validation would report only the first missing camera file.
             try:
                 actual_path(str(folder / path)).stat()

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,6 +16,8 @@ from taichi_msm.scene.section import MAX_POINTS
 
 # A sheet is refused if a larger share of its area than this has a larger isotropy error than that.
 MAX_COARSE_SHARE, MAX_ISOTROPY_ERROR = 0.1, 0.5
+
+FOLD_REMEDY = "take more sheet.points, or a smoother surface"
 
 # Smallest sine of the angle between the sides of a cell.
 MIN_SINE = 1e-6
@@ -46,12 +49,15 @@ def _fold(rest: CurvedRest) -> str:
     normals, cells = rest.cell_normals, rest.cells
     has_area = cells.area > MIN_SINE * cells.side_a * cells.side_b
     if not has_area.all():
-        return f"the cell at {describe_place(~has_area)} has no area; its corners must not be on a line"
+        return f"the cell at {describe_largest(~has_area)} has no area; its corners must not be on a line"
     if (angle := neighbour_angles(normals)).max(initial=0.0) > 90:
-        place = describe_place(angle == angle.max())
-        remedy = "take more sheet.points, or a smoother surface"
-        return f"the cell at {place} and the next one meet at {angle.max():.0f} degrees, more than 90; {remedy}"
+        return f"{describe_fold(angle)}, more than 90; {FOLD_REMEDY}"
     return ""
+
+
+def describe_fold(angles: Array) -> str:
+    """Describe the largest angle between neighbouring cells, from `neighbour_angles`."""
+    return f"the cell at {describe_largest(angles)} and the next one meet at {angles.max():.0f} degrees"
 
 
 def _anisotropy(rest: CurvedRest, kind: str) -> str:
@@ -61,7 +67,7 @@ def _anisotropy(rest: CurvedRest, kind: str) -> str:
         return ""
     return (
         f"{share:.0%} of the area is in cells with an isotropy error above {MAX_ISOTROPY_ERROR:g}, up to "
-        f"{errors.max():.3g} at {describe_place(errors == errors.max())}; {isotropy_remedy(rest, kind)}"
+        f"{errors.max():.3g} at {describe_largest(errors)}; {isotropy_remedy(rest, kind)}"
     )
 
 
@@ -87,7 +93,7 @@ def neighbour_angles(normals: Array) -> Array:
     return angles
 
 
-def describe_place(is_faulty: NDArray[np.bool_]) -> str:
-    """Return row and column of the first faulty cell."""
-    row, column = np.unravel_index(int(is_faulty.argmax()), is_faulty.shape)
+def describe_largest(values: NDArray[Any]) -> str:
+    """Return row and column of the first cell with the largest value, but for rounding."""
+    row, column = np.unravel_index(int((values >= (1 - 1e-9) * values.max()).argmax()), values.shape)
     return f"row {row}, column {column}"

@@ -6,7 +6,7 @@ import math
 from collections.abc import Collection, Mapping
 from typing import Annotated, Any, Literal
 
-from pydantic import Field, ValidationError, model_validator
+from pydantic import ConfigDict, Field, ValidationError, model_validator
 from typing_extensions import Self
 
 from taichi_msm.images import PictureError
@@ -32,6 +32,11 @@ from taichi_msm.scene.surface import PointGrid, RestSurface
 
 class Sheet(Section):
     """Sheet of mass points."""
+
+    # With surface.points, the size is not allowed, and the number of points is that of the file by default.
+    model_config = ConfigDict(
+        json_schema_extra={"required": [], "anyOf": [{"required": ["points", "size"]}, {"required": ["surface"]}]}
+    )
 
     points: tuple[NodeCount, NodeCount] = key(
         ...,

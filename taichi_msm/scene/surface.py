@@ -9,7 +9,7 @@ from typing import Annotated, Literal
 from pydantic import ConfigDict, Field, model_validator
 from typing_extensions import Self
 
-from taichi_msm.array_files import ArrayFile, read_array_file, smallest_step
+from taichi_msm.array_files import ArrayFile, quantum, read_array_file
 from taichi_msm.images import PICTURE_SUFFIXES, file_sha256, read_grey
 from taichi_msm.scene.section import MAX_MAGNITUDE, FilePath, NotNegative, Number, Positive, Section, key, scene_fault
 
@@ -47,7 +47,7 @@ class HeightField(Section):
             grey = read_grey(self.file, sha256)
             largest = 65535 if grey.dtype.itemsize == 2 else 255
             scale = (white - black) / largest
-            return ArrayFile(black + scale * grey, sha256, abs(scale) * smallest_step(grey))
+            return ArrayFile(black + scale * grey, sha256, abs(scale) * quantum(grey))
         assert self.unit is not None
         return read_array_file(self.file, metres(self.unit), ("height", "z"), lambda shape: len(shape) == 2, "(h, w)")
 

@@ -358,12 +358,13 @@ def _relocate(vary: dict[str, Any], fixed: dict[str, Any], folder: Path, scene_f
 
 
 def _matching_files(pattern: str, folder: Path, key: Key) -> list[str]:
-    """Return the files that match a pattern relative to a folder; for a key of pictures, only pictures."""
+    """Return the files that match a pattern relative to a folder, and have a suffix for the key."""
     # `glob` calls itself for each folder, and takes quadratic time for brackets.
     if len(pattern) > MAX_PATH or pattern.count("/") > MAX_FOLDERS:
         return []
     suffixes: tuple[str, ...] = PICTURE_SUFFIXES if key in scene_file.PICTURE_KEYS else ("",)
-    suffixes += ARRAY_SUFFIXES if key in scene_file.SURFACE_KEYS else ()
+    if key in scene_file.SURFACE_KEYS:
+        suffixes = (*PICTURE_SUFFIXES, *ARRAY_SUFFIXES) if "height" in key else ARRAY_SUFFIXES
     names = sorted(glob(pattern, root_dir=folder))  # noqa: PTH207  # Path.glob refuses absolute patterns
     return [text for text in names if text.lower().endswith(suffixes) and (folder / text).is_file()]
 
