@@ -112,19 +112,6 @@ def step_entries(plan: Plan, frames: int) -> dict[str, Any]:
     return {**dict.fromkeys(entries), "precision": grid.precision} if plan.scene.time.at_rest else entries
 
 
-def step_entries(plan: Plan, frames: int) -> dict[str, Any]:
-    """Build the entries of run.json about the steps to a frame; only the precision in a quasi-static scene."""
-    grid, limit = plan.grid, plan.stable_step
-    entries = {
-        "step": grid.step,
-        "stable_step": limit if limit < math.inf else None,
-        "steps_per_frame": grid.steps_per_frame,
-        "precision": grid.precision,
-        "steps": frames * grid.steps_per_frame,
-    }
-    return {**dict.fromkeys(entries), "precision": grid.precision} if plan.scene.time.at_rest else entries
-
-
 def estimate_budget(plan: Plan) -> Budget:
     """Estimate the memory and disk space of a run."""
     scene, grid = plan.scene, plan.grid
