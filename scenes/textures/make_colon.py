@@ -31,6 +31,7 @@ LENGTH = 0.15  # of the tube, from the bottom to the top of the picture [m]
 SPACING = 0.03  # of the folds, one of which is in the middle [m]
 EYE = 0.013  # from the bottom: the place of the endoscope [m]
 FADING = 0.14  # distance from it at which half of the light is left [m]
+DARK = 0.055  # from the top, where the tube ends: the beginning of darkness [m]
 HEIGHT, WIDTH = 1430, 1500  # of the picture [px]
 SUPERSAMPLING = 2  # vessels are drawn this much larger
 
@@ -105,6 +106,7 @@ def paint(seed: int = 7) -> Image.Image:
     )
     absorbance += np.multiply.outer(blood, HAEMOGLOBIN) + np.multiply.outer(1.2 + spots((0.6, 50)), FAT)
     light = (1 + 0.06 * crest) / (1 + (distance / FADING) ** 2)
+    light *= np.clip((LENGTH / 2 - y) / DARK, 0, 1)
     light = light * (1 + 0.014 * grain(rng, 1.2) + 0.018 * grain(rng, 3) + 0.016 * grain(rng, 6))
     picture = TISSUE * np.exp(-absorbance) * light[..., None]
     return Image.fromarray(np.clip(np.rint(picture), 0, 255).astype(np.uint8))

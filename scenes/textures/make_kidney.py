@@ -36,7 +36,7 @@ SPINE = 0.036, 1.0  # radius [m] of the arc about which it lies, and half of the
 UPWARD = 0.004  # of the kidney's middle above the middle of the sheet [m]
 
 CORTEX = np.array([170.0, 112.0, 90.0])  # RGB without blood
-YELLOW = np.array([222.0, 188.0, 130.0])
+YELLOW = np.array([204.0, 172.0, 118.0])
 PALE = np.array([236.0, 205.0, 196.0])
 BLURS = 0.7, 1.2, 2.2, 5.0  # of the layers of vessels [px]
 

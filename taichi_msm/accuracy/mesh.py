@@ -106,9 +106,8 @@ def coarser_plan(plan: Plan, ratio: float = 0.5) -> Plan | None:
     if ratio == SECOND_CELL_RATIO:
         # Numbers of cells with the parity of the plan's, so that both meshes have a mass point in the middle, under a
         # tool, or neither has.
-        cells = [
-            count - 1 - 2 * round((count - 1 - few) / 2) for count, few in zip(scene.sheet.points, cells, strict=True)
-        ]
+        pairs = zip(scene.sheet.points, cells, strict=True)
+        cells = [count - 1 - 2 * round((count - 1 - few) / 2) for count, few in pairs]
     # Numbers of cells are rounded up or down, to keep the aspect ratio of the cells below its limit.
     options = product(*({math.ceil(count) + 1, math.floor(count) + 1} for count in cells))
     scenes = [with_points(scene, (rows, cols)) for rows, cols in options]

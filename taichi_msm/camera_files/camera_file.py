@@ -26,10 +26,8 @@ MAX_DEPTH = 20
 MAX_DIGITS = 1000
 
 # Errors of Python's and PyYAML's parsers for invalid content.
-_PARSER_ERRORS = (
-    *(ArithmeticError, AttributeError, LookupError, RecursionError, SyntaxError, TypeError, ValueError),
-    yaml.YAMLError,
-)
+_PYTHON_ERRORS = ArithmeticError, AttributeError, LookupError, RecursionError, SyntaxError, TypeError, ValueError
+_PARSER_ERRORS = (*_PYTHON_ERRORS, yaml.YAMLError)
 
 
 class Entries(dict[str, Any]):

@@ -93,7 +93,7 @@ def _read_images(file: CameraFile) -> Trajectory | None:
             raise file.fault(fault, n)
         inverse = Rotation.from_quat((x, y, z, w)).inv()
         poses.append((n, [number, *(-inverse.apply(translation)).tolist(), *inverse.as_quat().tolist()]))
-    return Trajectory([row for _, row in poses], [n for n, _ in poses], has_times)
+    return Trajectory(poses, has_times)
 
 
 def _image(line: str) -> tuple[str, list[float], str] | None:

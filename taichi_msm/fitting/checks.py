@@ -7,9 +7,8 @@ from collections.abc import Iterator, Sequence
 import numpy as np
 
 from taichi_msm.fitting.observation import Array, Observation
-from taichi_msm.fitting.parameters import Parameter
 from taichi_msm.fitting.points import ROUNDING_SHARE
-from taichi_msm.fitting.predict import Prediction
+from taichi_msm.fitting.predict import FitProblem, Prediction
 from taichi_msm.model.rest import rest_of
 from taichi_msm.scene.scene import Scene
 from taichi_msm.scene.section import FRAME_TOLERANCE
@@ -31,14 +30,13 @@ def faults(observations: Sequence[Observation], scene: Scene, parameter_count: i
         yield f"{first.name}: no point moves {fault}; observe while a tool acts, at points near it"
 
 
-def faults_at_start(
-    observations: Sequence[Observation], scene: Scene, initial: Prediction, parameters: Sequence[Parameter] = ()
-) -> Iterator[str]:
+def faults_at_start(problem: FitProblem, scene: Scene, initial: Prediction) -> Iterator[str]:
     """Yield the faults found with a run of the initial scene: no motion at the times, another camera or origin, signs.
 
     The prediction reaches to the last frame. A free camera skips the check of the camera; a linear parameter, which may
     change sign, skips that of signs.
     """
+    observations, parameters = problem.observations, problem.parameters
     rate, motion, name = scene.time.frames_per_second, float(initial.motion.max()), observations[0].name
     if motion <= ROUNDING_SHARE * rest_of(scene.sheet).extent:
         yield f"{name}: none of its points moves in the scene; add probes that press near them"

@@ -35,7 +35,6 @@ from taichi_msm.fitting.parameters import (
     require_types,
     rounded,
 )
-from taichi_msm.fitting.points import PointObservation
 from taichi_msm.fitting.predict import FitProblem, Prediction, Runs, without_outputs
 from taichi_msm.fitting.profiles import Profile, Profiler, quadratic_profile
 from taichi_msm.fitting.report import publication, write_report
@@ -129,9 +128,7 @@ def fit(
             publisher = stack.enter_context(publication(Path(directory)))
         if settings is not None:
             name = str(Path(directory or "", FittedMap.FILE))
-            (points,) = problem.observations
-            assert isinstance(points, PointObservation)
-            result = fit_map(initial, points, settings, name, progress)
+            result = fit_map(initial, problem, settings, name, progress)
         else:
             kind = CurveRuns if has_curve(problem) else Runs
             runs = stack.enter_context(kind(problem, workers, progress))
@@ -177,7 +174,7 @@ def _fit(runs: Runs, scene: Scene, method: Method) -> FitResult:
     machine = runs.problem if isinstance(runs.problem, MachineProblem) else None
     messages: list[str] = []
     if machine is None:
-        messages += faults_at_start(observations, scene, initial, parameters)
+        messages += faults_at_start(runs.problem, scene, initial)
     if not any(probe.moved for probe in scene.probes):
         # Without position-controlled tools no tissue changes the forces, so a wrong unit is certain before the search.
         messages += unit_faults(observations, initial)

@@ -115,10 +115,9 @@ class CurveRuns(Runs):
         return self._predict(values, tangent.reach, tangent.forces * np.exp(distance @ tangent.slopes))
 
     def predict_coarse(self, x: Array, halvings: int) -> Prediction | None:
-        try:
+        with suppress(SceneError, DivergedError):
             return self.run_curve(x, halvings)
-        except (SceneError, DivergedError):
-            return None
+        return None
 
     def mesh_error(self, x: Array) -> float | None:
         # The run of the curve has the mesh error of the tests.
@@ -127,9 +126,7 @@ class CurveRuns(Runs):
 
     def run_curve(self, x: Array, halvings: int = 0) -> Prediction:
         """Return the prediction by a curve at x, shape (n,); raise the errors of `ForwardModel.predict`."""
-        values = self._model.values(x)
-        reach = self._reach(values)
-        return self._predict(values, reach, self._forces(values, reach, halvings))
+        return self._predict(*self._curve(x, halvings))
 
     def run_tests(self, x: Array) -> Prediction:
         """Return the prediction by runs of the tests at x; raise the errors of `ForwardModel.predict`."""
@@ -160,9 +157,7 @@ class CurveRuns(Runs):
 
     def set_tangent(self, x: Array) -> None:
         """Linearise the curve at x; raise the errors of `ForwardModel.predict`."""
-        values = self._model.values(x)
-        reach = self._reach(values)
-        forces, slopes = self._forces(values, reach), np.zeros((len(x), TRAVELS + 1))
+        (_, reach, forces), slopes = self._curve(x), np.zeros((len(x), TRAVELS + 1))
         for n in np.flatnonzero(self.changes_curve):
             shifted, delta = x.copy(), self.problem.difference_step
             delta = delta if x[n] + delta <= self.problem.parameters[n].limits[1] else -delta
@@ -190,15 +185,19 @@ class CurveRuns(Runs):
 
         Depths of contact that are given, or parameters, have no column.
         """
-        values = self._model.values(x)
-        reach = self._reach(values)
-        forces, step = self._forces(values, reach), 1e-3 * reach
-        columns = []
+        values, reach, forces = self._curve(x)
+        step, columns = 1e-3 * reach, []
         for loading, key in zip(self.problem.tests, self.problem.contact_keys, strict=True):
             if loading.finds_contact and key not in values:
                 moved = [self._predict(values | {key: loading.contact + end}, reach, forces) for end in (step, -step)]
                 columns.append((moved[0].values[0] - moved[1].values[0]) / (2 * step))
         return np.hstack([np.empty((sum(len(loading.force) for loading in self.problem.tests), 0)), *columns])
+
+    def _curve(self, x: Array, halvings: int = 0) -> tuple[dict[str, float], float, Array]:
+        """Return the parameter values by key at x, the greatest travel [m], and the forces of a curve."""
+        values = self._model.values(x)
+        reach = self._reach(values)
+        return values, reach, self._forces(values, reach, halvings)
 
     def _reach(self, values: dict[str, float]) -> float:
         """Return the greatest travel of a curve [m]; raise a SceneError if it is 0 in all tests."""

@@ -71,10 +71,8 @@ class Parameter:
         if not self.is_log:
             return (self.low - self.start) / self.scale, (self.high - self.start) / self.scale
         shares = sorted((self.low / self.start, self.high / self.start))
-        return (
-            math.log(shares[0]) if shares[0] > 0 else -MAX_LOG,
-            math.log(shares[1]) if shares[1] < math.inf else MAX_LOG,
-        )
+        low = math.log(shares[0]) if shares[0] > 0 else -MAX_LOG
+        return low, math.log(shares[1]) if shares[1] < math.inf else MAX_LOG
 
     def error(self, x: float, deviation: float) -> float:
         """Return the standard deviation of the value from that of x."""

@@ -25,6 +25,7 @@ PROFILE_TOLERANCE = 0.01
 COST_TOLERANCE, MAX_STEPS = 0.01, 8
 
 Side = Generator[Array, "Prediction | None", "list[ProfilePoint]"]
+Minimum = Generator[Array, "Prediction | None", "tuple[float, Array, bool]"]
 
 
 class ProfilePoint(NamedTuple):
@@ -119,9 +120,7 @@ class Profiler:
                 distance = min(distance * min(3.0, quantile / max(rise, 1e-3)), limit)
         return points
 
-    def _conditional_minimum(
-        self, n: int, x: Array, jacobian: Array
-    ) -> Generator[Array, Prediction | None, tuple[float, Array, bool]]:
+    def _conditional_minimum(self, n: int, x: Array, jacobian: Array) -> Minimum:
         """Minimise over the other parameters, and update the Jacobian.
 
         Return the cost, infinite if the run at x fails, its coordinates, and whether the search has converged.

@@ -15,7 +15,7 @@ from taichi_msm.fitting.checks import faults, faults_at_start
 from taichi_msm.fitting.observation import Array
 from taichi_msm.fitting.parameters import Bounds, Parameter, Request, make_parameters, rounded
 from taichi_msm.fitting.points import PointModel, PointObservation
-from taichi_msm.fitting.predict import Prediction, mesh_error, without_outputs
+from taichi_msm.fitting.predict import FitProblem, Prediction, mesh_error, without_outputs
 from taichi_msm.fitting.profiles import ProfilePoint
 from taichi_msm.fitting.rejection import by_chi_square
 from taichi_msm.fitting.result import Estimate, FitResult, FittedMap
@@ -86,9 +86,11 @@ def map_settings(request: Request) -> MapSettings | None:
 
 
 def fit_map(
-    scene: Scene, observations: PointObservation, settings: MapSettings, image: str, progress: StageProgressCallback
+    scene: Scene, problem: FitProblem, settings: MapSettings, image: str, progress: StageProgressCallback
 ) -> FitResult:
     """Return the fit of a map; `image`: path of the map's picture in the fitted scene."""
+    (observations,) = problem.observations
+    assert isinstance(observations, PointObservation)
     plan = _with_stable_steps(check_scene(without_outputs(scene)), settings.limits[1])
     require_differentiable(plan)
     if invalid := list(_faults(observations, scene, settings)):
@@ -115,7 +117,7 @@ def fit_map(
     report_progress()
     at_frames = model.on_sheet(adjoint.run(grid.factors(start[:cell_count]), report_progress))
     initial = model.predict(at_frames)
-    if invalid := list(faults_at_start([observations], scene, Prediction((initial,), 0, model.motion(at_frames)))):
+    if invalid := list(faults_at_start(problem, scene, Prediction((initial,), 0, model.motion(at_frames)))):
         raise SceneError(invalid)
     mesh_shift = 0.0
     if (coarse_plan := coarser_plan(plan)) is not None:

@@ -40,8 +40,8 @@ MAX_WEIGHT_CHANGE = 2.0
 # Largest change of the log of a map cell by the linearised solution, at which a search starts.
 MAX_INITIAL_STEP = 1.0
 
-# Step of finite differences of the log of a map cell.
-DIFFERENCE_STEP = 1e-2
+# Smallest step of finite differences of the log of a map cell, as a single cell changes the observations little.
+MIN_DIFFERENCE_STEP = 1e-2
 
 
 class SmoothnessWeight(NamedTuple):
@@ -169,8 +169,9 @@ class MapSearch:
         known, predicted = self.observations.known, self.predict(x)[1]
         residuals = (predicted - self.observations.values)[known] / self.sigma
         jacobian = np.empty((residuals.size, len(x)))
-        for n, change in enumerate(DIFFERENCE_STEP * np.eye(len(x))):
-            jacobian[:, n] = (self.predict(x + change)[1] - predicted)[known] / (DIFFERENCE_STEP * self.sigma)
+        step = max(MIN_DIFFERENCE_STEP, self.observations.difference_step(self.model.scene))
+        for n, change in enumerate(step * np.eye(len(x))):
+            jacobian[:, n] = (self.predict(x + change)[1] - predicted)[known] / (step * self.sigma)
         information, slope = jacobian.T @ jacobian, jacobian.T @ residuals
         min_chi_square = float(residuals @ residuals - slope @ np.linalg.pinv(information, hermitian=True) @ slope)
         variance = max(1.0, min_chi_square / max(1, residuals.size - len(x)))

@@ -129,9 +129,8 @@ def uncertainty(
     if error_correlation != (None, None):
         # U^T K U, and the effective number of observations tr(K)^2 / tr(K^2).
         pairs = zip(misfit.observations, misfit.split(singular.U), strict=True)
-        matrices, squares = zip(
-            *(observed.correlated(part, error_correlation) for observed, part in pairs), strict=True
-        )
+        parts = (observed.correlated(part, error_correlation) for observed, part in pairs)
+        matrices, squares = zip(*parts, strict=True)
         independent = min(len(singular.U) ** 2 / sum(squares), freedom)
         values, vectors = np.linalg.eigh(np.sum(matrices, axis=0))
         root = independent_root @ (vectors * np.sqrt(np.maximum(values, 0.0)))

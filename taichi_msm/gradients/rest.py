@@ -135,9 +135,8 @@ def _stiffness(
 
     shape = plan.scene.sheet.points
     number, axis = np.arange(plan.fixed.size).reshape(shape), np.arange(3)
-    total = sparse.diags(foundation.tangent.ravel()) + plan.material.bending * sparse.kron(
-        laplacian.T @ laplacian, sparse.identity(3)
-    )
+    bending = plan.material.bending * sparse.kron(laplacian.T @ laplacian, sparse.identity(3))
+    total = sparse.diags(foundation.tangent.ravel()) + bending
     for family in families:
         blocks = family.tangent(u).reshape(-1, 3, 3)
         p, q = (3 * number[end].reshape(-1, 1, 1) for end in (family.start, family.end))

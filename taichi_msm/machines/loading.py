@@ -179,10 +179,9 @@ def build_loading(
         contact = float(test.depth[0 if is_clamp else _contact_row(test, noise, peak)])
     if test.depth[peak] <= contact:
         fall = f"the depth falls from {contact:.4g} to {test.depth[peak]:.4g} m"
-        fault = (
-            f"{fall} while the force rises to {test.force[peak]:.4g} N: is its sign opposite to the motion of the tool?"
-        )
-        raise SceneError([f"{test.name}: {fault} Choose another depth by --columns, or change its sign"])
+        question = f"the force rises to {test.force[peak]:.4g} N: is its sign opposite to the motion of the tool?"
+        remedy = "Choose another depth by --columns, or change its sign"
+        raise SceneError([f"{test.name}: {fall} while {question} {remedy}"])
     if rate is None and scene.time.at_rest and not (scene.tissue and scene.tissue.relaxation):
         frames, rate = _sample_in_depth(test, noise, contact, finds_contact=finds_contact)
     else:
@@ -232,11 +231,9 @@ def late_contact_note(loading: Loading, key: str) -> str | None:
     # Ten independent rows have a rank correlation above 0.55 with a probability of 0.015.
     if not (significant > 0.01 * loading.peak and correlation > 0.55):
         return None
-    return (
-        f"{test.name}: the force rises within the first {count} rows, so its noise, {loading.noise:.3g} N, is "
-        f"too large: the tool touches before {1000 * loading.contact:.4g} mm, where the force is {significant:.3g} N; "
-        f"find the depth by --free {key}, or give it by --contact"
-    )
+    fault = f"the force rises within the first {count} rows, so its noise, {loading.noise:.3g} N, is too large"
+    effect = f"the tool touches before {1000 * loading.contact:.4g} mm, where the force is {significant:.3g} N"
+    return f"{test.name}: {fault}: {effect}; find the depth by --free {key}, or give it by --contact"
 
 
 class _Frames(NamedTuple):

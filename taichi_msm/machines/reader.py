@@ -145,9 +145,8 @@ def cut_window(test: MachineTest, start: float, end: float) -> MachineTest:
 
 def _orient(test: MachineTest) -> MachineTest:
     """Flip signs so that the largest magnitudes are positive, and add a warning about torn tissue."""
-    depth, force = (
-        values if values[np.abs(values).argmax()] >= 0 else 0.0 - values for values in (test.depth, test.force)
-    )
+    columns = test.depth, test.force
+    depth, force = (each if each[np.abs(each).argmax()] >= 0 else 0.0 - each for each in columns)
     test, time, peak = replace(test, depth=depth, force=force), test.time, int(force.argmax())
     fallen = np.flatnonzero(force[peak:] < force[peak] / 2) + peak
     if not len(fallen) or not peak:
@@ -206,12 +205,9 @@ def _find_blocks(grid: Grid, chosen: dict[str, str], min_rows: int = MIN_ROWS) -
         rows = [n for n in range(header + 1, end) if grid.has_content(n)]
         candidates = _find_candidates(grid.rows[header], chosen)
         first = rows[0] if rows else None
-        has_units = any(
-            _unit_factor(quantity, grid.cell(first, index)) is not None
-            for quantity, columns in candidates.items()
-            for index in columns
-        )
-        units, rows = (rows[0], rows[1:]) if has_units else (None, rows)
+        pairs = ((quantity, index) for quantity, columns in candidates.items() for index in columns)
+        has_units = any(_unit_factor(quantity, grid.cell(first, index)) is not None for quantity, index in pairs)
+        units, rows = (first, rows[1:]) if has_units else (None, rows)
         counts = [sum(parse_number(cell) is not None for cell in grid.rows[n]) for n in rows]
         if sum(count >= len(WORDS) for count in counts) >= min_rows:
             blocks.append(_Block(header, units, rows, end))

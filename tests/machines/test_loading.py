@@ -20,7 +20,9 @@ from taichi_msm.machines.loading import (
     require_plausible_travel,
 )
 from taichi_msm.machines.reader import MachineTest
+from taichi_msm.model.rest import rest_of
 from taichi_msm.scene.scene import Scene
+from taichi_msm.scene.sheet import Sheet
 from tests.golden import Messages
 
 Array = NDArray[np.float64]
@@ -207,3 +209,29 @@ PATHS: dict[str, list[dict[str, Any]]] = {
 def test_scenes_without_a_line_of_one_tool_are_refused(case: str, message: Messages) -> None:
     with message.raises(SceneError, "probes"):
         find_approach(scene(PATHS[case]))
+
+
+@pytest.mark.parametrize("end", [[0.3, 0.7, -0.002], [0.45, 0.6, -0.003]], ids=["normal", "oblique"])
+def test_line_of_a_tool_over_a_dome(end: list[float]) -> None:
+    """It starts at contact with the surface; keyframes are on the line, which is straight along a normal."""
+    ball = {**PRESS, "path": [[0, 0.3, 0.7, 0.002], [1, *end]]}
+    made = scene([ball], foundation=1e6).model_copy(
+        update={"sheet": Sheet(points=(8, 8), size=(0.02, 0.02), surface={"dome": {"radius": 0.03}})}
+    )
+    approach = find_approach(made)
+    travel = np.array([0.0, 5e-4, 1e-3])
+    data = approach.place(made.model_dump(mode="json", exclude_none=True), travel, rate=1.0)
+    placed = check_scene(data)
+    (tool,) = placed.tools
+    centres = tool.path_at(np.arange(3.0))
+    expected = approach.start + travel[:, None] * approach.direction
+    np.testing.assert_allclose(centres, expected, atol=1e-12)
+    # The sphere is bilinear within cells, 3 mm wide: at most (3 mm)^2 / 4 / 30 mm inside.
+    centre = np.array([0, 0, -0.03])
+    assert -7.5e-5 < np.linalg.norm(approach.start - centre) - 0.03 - RADIUS < 1e-3 * RADIUS
+    if end[:2] == [0.3, 0.7]:
+        keys = np.array(data["probes"][0]["path"])
+        np.testing.assert_allclose(keys[:, 1:3], [[0.3, 0.7]] * 3, atol=1e-12)
+        np.testing.assert_allclose(keys[0, 3] - keys[:, 3], travel, atol=1e-12)
+        normal = rest_of(made.sheet).normals(np.array([[0.3, 0.7]]))[0]
+        np.testing.assert_allclose(approach.direction, -normal, atol=1e-12)

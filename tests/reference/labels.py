@@ -13,10 +13,11 @@ from taichi_msm.scene.scene import Scene
 from tests.reference.drawing import rasterise, refine, triangles, weights
 from tests.reference.lens import distort
 from tests.reference.shading import intersect
+from tests.reference.surface import rest_positions
 
 Array = NDArray[np.float64]
 
-# A surface in front of a point by less than this fraction of the sheet's larger side does not hide it.
+# A surface in front of a point by less than this fraction of the sheet's largest side does not hide it.
 TOUCHING = 1e-9
 
 
@@ -80,7 +81,8 @@ def project(scene: Scene, coordinates: Array, position: Array) -> tuple[Array, N
         pixels = np.stack(distort(camera, across, along), axis=-1) * camera.scale + camera.centre
         pixels[~(np.hypot(across, along) < camera.lens.limit)] = np.nan
     hidden: NDArray[np.bool_] = np.logical_not(((pixels >= 0) & (pixels < (width, height))).all(axis=1))
-    limit = projected[:, 3] - TOUCHING * max(scene.sheet.size)
+    rest = rest_positions(scene.sheet.surface, scene.sheet.points, scene.sheet.size)
+    limit = projected[:, 3] - TOUCHING * float(np.ptp(rest, axis=(0, 1)).max())
     for triangle in triangles(surface):
         share = weights(triangle, x, y)
         w, depth = np.tensordot(triangle[:, 2:].T, share, 1)
