@@ -229,9 +229,11 @@ def test_steep_heights(write: Callable[..., Path], message: Messages) -> None:
     np.save("z.npy", 30 * np.add.outer(np.arange(9), np.arange(11)))
     with message.raises(SceneError, "s.yaml:5:6: sheet.surface.height: "):
         load_scene(write("{height: {file: z.npy, unit: mm}}"))
-    # The sides of cells are almost parallel.
+    # The sides of cells are almost parallel, or parallel but for rounding.
     with pytest.raises(SceneError, match=r"sheet\.surface\.height: .*less steep"):
         load_scene("s.yaml", {"sheet.surface.height.unit": "m"})
+    with pytest.raises(SceneError, match=r"sheet\.surface\.height: the cell at row 0, column 0 has no area"):
+        load_scene("s.yaml", {"sheet.surface.height.unit": 1e3, "sheet.size": [8e-5, 1e-4]})
 
 
 def test_a_tube_of_few_points(write: Callable[..., Path], message: Messages) -> None:
