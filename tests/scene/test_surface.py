@@ -178,6 +178,7 @@ def test_missing_files(points: str, write: Callable[..., Path]) -> None:
         load_scene(write("{points: {file: p.npz, unit: mm}}", points))
 
 
+@pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="needs pipes")
 @pytest.mark.parametrize("kind", ["folder", "pipe"])
 def test_irregular_files(kind: str, write: Callable[..., Path], message: Messages) -> None:
     (os.mkdir if kind == "folder" else os.mkfifo)("p.npy")
@@ -258,6 +259,12 @@ def test_lines_of_check(write: Callable[..., Path], message: Messages) -> None:
         ("{points: {file: p.npy, unit: mm}}",),
     ):
         message(lines(write(*arguments)))
+
+
+def test_springs_are_not_isotropic_tissue(write: Callable[..., Path]) -> None:
+    springs = {"tissue": None, "springs": {"structural": 20}, "sheet.mass": 1e-3}
+    plan = load_plan(write("{dome: {radius: 0.08}}"), springs)
+    assert not any("isotropy" in line for line in (*surface_notes(plan.scene), *describe_surface(plan)))
 
 
 def test_a_note_about_sharp_folds(write: Callable[..., Path], message: Messages) -> None:
