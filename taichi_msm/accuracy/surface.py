@@ -88,21 +88,15 @@ def describe_surface(plan: Plan) -> Iterator[str]:
         return
     cells, (rows, cols) = rest.cells, plan.scene.sheet.points
     aspect = np.maximum(cells.side_a / cells.side_b, cells.side_b / cells.side_a)
-    angles, isotropy = np.degrees(np.arccos(cells.cosine)), record["isotropy_error"]
+    angles = np.degrees(np.arccos(cells.cosine))
     low, high = f"{angles.min():.0f}", f"{angles.max():.0f}"
     yield (
         f"surface: {record['kind']}, {rows} x {cols} points, cells of {rest.shortest_side:.3g} to "
         f"{rest.longest_side:.3g} m, at most {aspect.max():.3g} times as long as wide, with sides at "
         f"{low if low == high else f'{low} to {high}'} degrees"
     )
-    line = "surface: isotropy error 0"
-    # Rectangles and rhombi are exact but for rounding.
-    if isotropy["worst"] > 1e-9:
-        worst = describe_largest(rest.isotropy_errors)
-        line = f"surface: isotropy error {isotropy['mean']:.2g} on the mean, {isotropy['worst']:.2g} at {worst}"
-    clamped = record["clamped"]
-    count = f"{clamped} cells are" if clamped > 1 else "a cell is"
-    yield f"{line}; {count} clamped, as a spring would need a stiffness below 0" if clamped else line
+    if plan.scene.tissue is not None:
+        yield _describe_isotropy(rest, record)
     if not plan.scene.time.at_rest:
         squares = fictitious_masses(plan.material, plan.scene.sheet)
         if plan.material.by_area:
@@ -118,3 +112,13 @@ def describe_surface(plan: Plan) -> Iterator[str]:
         pressures = np.abs((pulls * rest.point_normals).sum(axis=-1)) / rest.areas
         largest = float(pressures[~plan.fixed].max(initial=0.0))
         yield f"surface: at rest, a pressure of up to {largest:.4g} Pa holds the pretension"
+
+
+def _describe_isotropy(rest: CurvedRest, record: SurfaceRecord) -> str:
+    isotropy, clamped, line = record["isotropy_error"], record["clamped"], "surface: isotropy error 0"
+    # Rectangles and rhombi are exact but for rounding.
+    if isotropy["worst"] > 1e-9:
+        place = describe_largest(rest.isotropy_errors)
+        line = f"surface: isotropy error {isotropy['mean']:.2g} on the mean, {isotropy['worst']:.2g} at {place}"
+    count = f"{clamped} cells are" if clamped > 1 else "a cell is"
+    return f"{line}; {count} clamped, as a spring would need a stiffness below 0" if clamped else line

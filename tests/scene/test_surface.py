@@ -178,6 +178,7 @@ def test_missing_files(points: str, write: Callable[..., Path]) -> None:
         load_scene(write("{points: {file: p.npz, unit: mm}}", points))
 
 
+@pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="needs pipes")
 @pytest.mark.parametrize("kind", ["folder", "pipe"])
 def test_irregular_files(kind: str, write: Callable[..., Path], message: Messages) -> None:
     (os.mkdir if kind == "folder" else os.mkfifo)("p.npy")
@@ -229,9 +230,11 @@ def test_steep_heights(write: Callable[..., Path], message: Messages) -> None:
     np.save("z.npy", 30 * np.add.outer(np.arange(9), np.arange(11)))
     with message.raises(SceneError, "s.yaml:5:6: sheet.surface.height: "):
         load_scene(write("{height: {file: z.npy, unit: mm}}"))
-    # The sides of cells are almost parallel.
+    # The sides of cells are almost parallel, or parallel but for rounding.
     with pytest.raises(SceneError, match=r"sheet\.surface\.height: .*less steep"):
         load_scene("s.yaml", {"sheet.surface.height.unit": "m"})
+    with pytest.raises(SceneError, match=r"sheet\.surface\.height: the cell at row 0, column 0 has no area"):
+        load_scene("s.yaml", {"sheet.surface.height.unit": 1e3, "sheet.size": [8e-5, 1e-4]})
 
 
 def test_a_tube_of_few_points(write: Callable[..., Path], message: Messages) -> None:
@@ -256,6 +259,12 @@ def test_lines_of_check(write: Callable[..., Path], message: Messages) -> None:
         ("{points: {file: p.npy, unit: mm}}",),
     ):
         message(lines(write(*arguments)))
+
+
+def test_springs_are_not_isotropic_tissue(write: Callable[..., Path]) -> None:
+    springs = {"tissue": None, "springs": {"structural": 20}, "sheet.mass": 1e-3}
+    plan = load_plan(write("{dome: {radius: 0.08}}"), springs)
+    assert not any("isotropy" in line for line in (*surface_notes(plan.scene), *describe_surface(plan)))
 
 
 def test_a_note_about_sharp_folds(write: Callable[..., Path], message: Messages) -> None:
