@@ -55,6 +55,11 @@ CASES: dict[str, Any] = {
     },
     "tube, friction": {"surface": TUBE, "probes": [{**BALL, "friction": 0.4}, LOADS[0]]},
     "dome, grip": {"surface": DOME, "probes": [{**BALL, "grip": [[0.05, 0.2]]}]},
+    "tube, clamp": {
+        "surface": TUBE,
+        "tissue": {"relaxation": [{"share": 0.3, "time": 0.1}], "foundation_active": "always"},
+        "probes": [{"clamp": "right", "path": [[0, 0, 0, 0], [0.06, 0.003, 0.002, -0.004]]}, BALL],
+    },
     "tube from outside": {"surface": {"tube": {"radius": -0.03}}, "probes": [BALL]},
     "springs": {"surface": DOME, "springs": {"structural": 20, "shear": 10, "virtual": 2}, "probes": [BALL]},
 }
@@ -141,3 +146,12 @@ def test_material_matches_twin(case: str) -> None:
         np.testing.assert_allclose(k, own.stiffness, rtol=1e-12)
     frequency = highest_frequency(plan.material, scene.sheet)
     assert frequency == pytest.approx(twin_frequency(scene), rel=1e-12)
+
+
+def test_motion_in_f32(device: Device) -> None:
+    """A load and a ball that move along a tube, in f32: 3e-7 of the displacement, and of the surface's position."""
+    scene = scene_of("tube, friction", precision="f32")
+    twin = [u for u, _ in reference.steps(make_plan(scene))]
+    steps = make_plan(scene).grid.steps_per_frame
+    expected = np.array(twin[steps::steps])
+    np.testing.assert_allclose(frames(scene, device), expected, rtol=0, atol=1e-4 * np.abs(expected).max())
