@@ -36,7 +36,7 @@ def drawing_warnings(scene: Scene) -> Iterator[str]:
             continue
         normals = _normals_on_path(probe, scene.sheet)
         if (pierced := np.flatnonzero(normals @ instrument.shaft < 0)).size:
-            normal = ", ".join(f"{component:.3g}" for component in normals[pierced[0]] + 0.0)
+            normal = ", ".join(f"{component:g}" for component in normals[pierced[0]].round(2) + 0.0)
             is_flat = scene.sheet.surface is None
             side = "with z above 0" if is_flat else f"less than 90 degrees from the normal there, [{normal}]"
             yield (

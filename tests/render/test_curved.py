@@ -30,7 +30,7 @@ Array = NDArray[np.float64]
 TUBE: dict[str, Any] = {"tube": {"radius": 0.025, "folds": {"depth": 0.004, "spacing": 0.03}}}
 DOME: dict[str, Any] = {"dome": {"radius": 0.04}}
 LENS = {"intrinsics": {"fx": 34, "fy": 33, "cx": 40.2, "cy": 29.3}, "distortion": {"k1": -0.1, "k2": 0.01}}
-WIDE = {"intrinsics": {"fx": 60, "fy": 58, "cx": 40.2, "cy": 29.3}}
+WIDE = {"intrinsics": {"fx": 72, "fy": 70, "cx": 40.2, "cy": 29.3}}
 # Along the axis of the tube, by a lens of 100 degrees; and on a dome.
 ENDOSCOPE = {"eye": [0, -0.05, 0.022], "target": [0.003, 0.05, 0.025], "up": [0, 0, 1], **LENS, "outside": "background"}
 CASES: dict[str, tuple[dict[str, Any], Any]] = {
@@ -83,7 +83,8 @@ def test_labels_match_the_twin(case: str, device: Device) -> None:
     position = dented(made)
     assert assert_labels_match_twin(made, position).instrument.any()
     hidden = assert_tracks_match_twin(made, position)
-    assert 0 < hidden.mean() < 1 or case == "tube-top"
+    assert hidden.mean() < 1
+    assert hidden.any() or case in ("tube-top", "bowl-fit")
     placed = place_instruments(made, position, 0)
     normals, expected = draw_labels(made, position, LABELS).normals, twin.normals(made, position, placed)
     visible = ~np.isnan(expected[..., 0]) & ~np.isnan(normals[..., 0])

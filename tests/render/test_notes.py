@@ -163,3 +163,18 @@ def test_invisible_sheet(tmp_path: Path, camera: dict[str, Any], message: Messag
 )
 def test_barely_visible_sheet(tmp_path: Path, camera: dict[str, Any]) -> None:
     assert not list(drawing_warnings(with_picture(tmp_path, (400, 300), render={"camera": camera})))
+
+
+@pytest.mark.parametrize(("shaft", "pierces"), [([1, 0, 0.1], False), ([-0.2, 0, 1], True)])
+def test_shaft_through_a_curved_sheet(shaft: list[float], pierces: bool, message: Messages) -> None:
+    """At the left side of a tube that is seen from inside the normal points to the right."""
+    path = {"path": [[0, 0.5, 0.5, 0.01], [1, 0.25, 0.5, 0.01]]}
+    for motion in (path, {"at": [0.25, 0.5], "force": -1}):
+        made = scene(
+            sheet={**SHEET, "size": [0.1, 0.0628], "surface": {"tube": {"radius": 0.01}}},
+            probes=[{**motion, "instrument": {"radius": 0.001, "shaft": shaft, "length": 0.005}}],
+        )
+        warnings = list(drawing_warnings(made))
+        assert len(warnings) == pierces
+        if pierces:
+            message(warnings, "probes.0.instrument", "[1, 0, 0]")
