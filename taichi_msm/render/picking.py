@@ -51,7 +51,7 @@ def pick_at_rest(sheet: Sheet, refine: int, view: View, pixel: Pair) -> Pair | N
     point = intersect_rest_plane(view, pixel)
     if point is None:
         return None
-    across, down = rest.fractions(point).tolist()
+    across, down = rest.fractions(point.astype(np.float64)).tolist()
     return across, down
 
 

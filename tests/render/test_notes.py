@@ -40,18 +40,6 @@ def test_implausible_instruments(instrument: dict[str, Any], message: Messages) 
     message(warning, "probes.0.instrument")
 
 
-def test_shaft_through_a_curved_sheet(message: Messages) -> None:
-    """A shaft along x is on the inner side of the left wall of a tube, and behind the right one."""
-    instrument = {"radius": 0.01, "shaft": [1, 0, 0], "length": 0.1}
-
-    def warnings(across: float) -> list[str]:
-        probe = {**PRESS, "at": [across, 0.5], "instrument": instrument}
-        return list(drawing_warnings(scene(sheet={**SHEET, "surface": {"tube": {"radius": 0.1}}}, probes=[probe])))
-
-    message(warnings(0.95), "probes.0.instrument")
-    assert not warnings(0.05)
-
-
 @pytest.mark.parametrize(
     ("size", "sheet", "region"),
     [((300, 600), "0.4,0.2", "0,187,300,225"), ((800, 300), "0.15,0.4", "200,0,400,300")],
