@@ -108,6 +108,8 @@ class PathDependence:
         # A difference above 1 % of the largest displacement means different equilibria.
         if distance > 0.01 * self._largest:
             remedy = "tissue.pretension, bending or a stiffer foundation"
+            if self._plan.scene.sheet.surface:
+                remedy = "tissue.pretension or a stiffer foundation"
             if self._plan.scene.tissue is None:
                 remedy = "larger springs.virtual"
             yield (
