@@ -168,8 +168,8 @@ def test_motion_in_f32(device: Device) -> None:
 
 
 def test_spacing_is_that_under_the_path(tmp_path: Path) -> None:
-    """The columns under the ball are 1 mm apart, those at the far side 4 mm."""
-    x = np.cumsum([0.0] + [0.001] * 12 + [0.004] * 6)
+    """The columns under the ball are 1 mm apart, those at the far side 1.5 mm."""
+    x = np.cumsum([0.0] + [0.001] * 12 + [0.0015] * 6)
     np.save(tmp_path / "grid.npy", np.stack(np.broadcast_arrays(x, -0.001 * np.arange(9)[:, None], 0.0), axis=-1))
     path = [[0, 0.2, 0.5, 0.001], [1, 0.4, 0.5, 0.001]]
     scene = scene_of("tube, loads").model_copy(
@@ -180,4 +180,4 @@ def test_spacing_is_that_under_the_path(tmp_path: Path) -> None:
     )
     (tool,) = solid_tools(make_plan(scene).tools).values()
     assert tool.point_spacing(scene.sheet) == pytest.approx(0.001)
-    assert rest_of(scene.sheet).longest_side == pytest.approx(0.004)
+    assert rest_of(scene.sheet).longest_side == pytest.approx(0.0015)
