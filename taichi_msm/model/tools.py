@@ -238,8 +238,9 @@ class FollowingTool(SolidTool):
 
     def path_at(self, t: Array) -> Array:
         points, normals, heights = self._follow(t)
-        # `tip_height` of each shape depends on the angle between its axis and N only.
-        tips = [tip_offset(self.shape, self.axis, self.radius, normal) for normal in normals]
+        # `tip_height` of each shape depends on the angle between its axis and N only, of a round one not even on it.
+        distinct = normals[:1] if self.shape.is_round else normals
+        tips = [tip_offset(self.shape, self.axis, self.radius, normal) for normal in distinct]
         return points + (heights + tips)[:, None] * normals
 
     @cached_property
