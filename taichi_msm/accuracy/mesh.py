@@ -146,8 +146,9 @@ def _with_equal_force(probe: Probe, sheet: Sheet, coarse: Sheet) -> Probe:
 
 def _sampling_force_error(probes: Sequence[Probe], sheet: Sheet) -> float:
     """Return the largest relative difference between a tool's force on the mesh and on a much finer mesh."""
-    # The force of a tool is summed over at most 4 million mass points.
-    refinement = min(8, math.isqrt(4_000_000 // math.prod(sheet.points)))
+    # The force of a tool is summed over at most 4 million mass points, of a curved sheet, which is kept, over fewer.
+    max_points = 4_000_000 if sheet.surface is None else 250_000
+    refinement = min(8, math.isqrt(max_points // math.prod(sheet.points)))
     if refinement < 2:
         return 0.0  # With cells this small, no tool is as narrow as a cell.
     pushing = [probe for probe in probes if probe.total is not None]

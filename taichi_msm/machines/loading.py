@@ -38,7 +38,7 @@ NORMAL_FACTOR = 1.48
 # Smallest force in contact, in units of the noise.
 CONTACT_NOISES = 5.0
 
-# Spacing of the points of a curved sheet at the first contact, in radii of the tool: within 1e-3 of a radius.
+# Spacing of the points of a curved sheet at the first contact, in radii of the tool.
 MAX_SPACING_RADII = 1 / 16
 
 # Share of the travel that frames begin before the contact; largest share at an estimated contact.
@@ -106,13 +106,13 @@ def _first_contact(tool: SolidTool, direction: Array, sheet: Sheet) -> Array | N
     start, tolerance = tool.path[0], 1e-9 * tool.radius
     rest, travel = rest_of(sheet), 0.0
     reach = float(np.linalg.norm(start - rest.box.mean(axis=0))) + tool.length + rest.diagonal
-    refine = math.ceil(rest.longest_side / (MAX_SPACING_RADII * tool.radius)) - 1
+    points = tool.points_between(sheet, MAX_SPACING_RADII)
     # Sphere tracing: the tool advances by its gap to the sheet. The gap of a tilted plate is approximate, so the tool
     # may have to go back.
     goes_back = False
     for _ in range(1000):
         centre = start + travel * direction
-        gap = tool.gap_at(centre, sheet, refine)
+        gap = tool.gap_at(centre, sheet, points)
         if abs(gap) <= tolerance or (goes_back and gap > 0):
             return np.asarray(centre)
         goes_back = goes_back or gap < 0

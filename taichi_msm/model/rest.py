@@ -259,7 +259,7 @@ class _Surface:
         return hash(self._key)
 
 
-@lru_cache(maxsize=16)
+@lru_cache(maxsize=8)
 def _rest(points: tuple[int, int], size: tuple[float, float], surface: _Surface) -> Rest:
     if surface.sheet.surface is None:
         return FlatRest(points, size)

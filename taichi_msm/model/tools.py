@@ -165,10 +165,10 @@ class SolidTool(Tool):
         """Return the distance at a time [s] from the sheet at rest [m], negative inside the sheet."""
         return self.gap_at(self.path_at(np.array([t]))[0], sheet)
 
-    def gap_at(self, centre: Array, sheet: Sheet, refine: int = 0) -> float:
-        """Return the gap with c at a place [m], on a curved sheet from points, `refine` between mass points."""
+    def gap_at(self, centre: Array, sheet: Sheet, points: Array | None = None) -> float:
+        """Return the gap [m] with c at a place; on a curved sheet from points, shape (n, 3), or its mass points."""
         if sheet.surface:
-            r = rest_of(sheet).refined(refine) - centre
+            r = (rest_of(sheet).outline if points is None else points) - centre
             depth, *_ = self.shape.build_depth(NUMPY)(*r.T, *self.axis, self.length, self.radius)
             return -float(depth.max())
         half = np.array([sheet.size[1] / 2, sheet.size[0] / 2, 0.0])
@@ -181,8 +181,14 @@ class SolidTool(Tool):
 
     def reaches(self, scene: Scene) -> bool:
         """Return whether the tool meets the sheet at rest at any frame or keyframe."""
-        times = [*np.linspace(0, scene.time.duration, scene.time.frames + 1), *self.times]
-        return any(self.gap(scene.sheet, t) < 0 for t in times if t <= scene.time.duration)
+        times = np.array([*np.linspace(0, scene.time.duration, scene.time.frames + 1), *self.times])
+        centres, points = self.path_at(times[times <= scene.time.duration]), self.points_between(scene.sheet)
+        return any(self.gap_at(centre, scene.sheet, points) < 0 for centre in centres)
+
+    def points_between(self, sheet: Sheet, radii: float = 0.5) -> Array | None:
+        """Return points of a curved sheet, some radii or a tenth of a cell apart; None for a flat one."""
+        rest = rest_of(sheet)
+        return None if rest.is_flat else rest.refined(min(9, int(rest.longest_side / (radii * self.radius))))
 
     def problems(self, scene: Scene, grid: TimeGrid) -> Iterator[Problem]:
         key, depth = ("probes", self.probe, "path"), -self.gap(scene.sheet)

@@ -55,7 +55,7 @@ def pick_at_rest(sheet: Sheet, refine: int, view: View, pixel: Pair) -> Pair | N
     return across, down
 
 
-def intersect_rest_plane(view: View, pixel: Pair) -> NDArray[np.floating] | None:
+def intersect_rest_plane(view: View, pixel: Pair) -> Array | None:
     """Return x and y [m] of the point of a flat sheet's plane at rest that a pixel shows; None without one."""
     matrix = view.centred_at(pixel).matrix
     planar = matrix[:2, :2]
@@ -63,7 +63,7 @@ def intersect_rest_plane(view: View, pixel: Pair) -> NDArray[np.floating] | None
     is_finite = np.isfinite(planar).all()
     if not is_finite or not abs(np.linalg.det(planar)) > 1e-9 * np.linalg.norm(planar, axis=1).prod():
         return None
-    point = np.linalg.solve(planar, -matrix[:2, 3])
+    point: Array = np.asarray(np.linalg.solve(planar, -matrix[:2, 3]), dtype=float)
     return point if matrix[2] @ [*point, 0, 1] > view.near else None
 
 

@@ -10,6 +10,7 @@ from taichi_msm import Simulation
 from taichi_msm.accuracy.buckling import buckling_warnings
 from taichi_msm.accuracy.path_dependence import PathDependence
 from taichi_msm.model.rest import rest_normals, rest_of
+from taichi_msm.model.tools import solid_tools
 from taichi_msm.scene.scene import Scene
 from taichi_msm.solver.planning import make_plan
 from taichi_msm.system.runtime import Device
@@ -56,3 +57,15 @@ def test_change_of_a_moving_load_is_the_distance_along_the_surface() -> None:
     made = scene([{"at": [[0, 0.25, 0.5], [1, 0.3125, 0.5]], "total": -0.2, "radius": 0.006, "load": [[0, 100]]}])
     expected = 0.0628 / 64 / rest_of(made.sheet).extent
     assert PathDependence(make_plan(made))._load_change(1) == pytest.approx(expected, rel=0.01)
+
+
+@pytest.mark.parametrize(("height", "reaches"), [(0.0005, False), (-0.001, True)])
+def test_tool_between_the_mass_points_reaches_the_sheet(height: float, reaches: bool) -> None:
+    """A needle in the middle of a cell at the side of a tube: none of the mass points, 3 mm away, touches it."""
+    needle = {"radius": 2e-4, "shaft": [1, 0, 0], "length": 0.01}
+    across, down = 0.28125, 0.4375
+    path = [[0, across, down, 0.002], [1, across, down, height]]
+    made = scene([{"path": path, "instrument": needle}])
+    (tool,) = solid_tools(make_plan(made).tools).values()
+    assert tool.gap(made.sheet, 1.0) > 1e-3
+    assert tool.reaches(made) == reaches

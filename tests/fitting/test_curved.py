@@ -52,7 +52,7 @@ def observations(truth: Scene, kind: str, device: Device) -> NDArray[np.float64]
             if kind == "position":
                 values.append(surface_positions(simulation.positions(), truth.render.refine, PLACES))
             else:
-                values.append(simulation.locate(PLACES).pixels)
+                values.append(simulation.locate(PLACES).pixels.astype(float))
     return np.stack(values, axis=1)
 
 

@@ -155,12 +155,13 @@ def test_tip_moves_at_most_by_its_stride_on_a_dome(begin: Begin) -> None:
 
 
 def test_orbit_is_about_the_middle_of_the_surface(begin: Begin) -> None:
-    for camera in ("top", {"eye": [0.02, -0.1, 0.15]}):
+    cameras: list[Any] = ["top", {"eye": [0.02, -0.1, 0.15]}]
+    for camera in cameras:
         session = begin({"tube": {"radius": 0.04}}, **{"render.camera": camera})
         rest = rest_of(session.scene.sheet)
         middle = rest.place(np.array([[0.5, 0.5]]))[0]
-        for event in (Turn(0, 0), Turn(30, -12), Turn(-7, 20)):
-            session.handle(event)
+        for right, down in ((0, 0), (30, -12), (-7, 20)):
+            session.handle(Turn(right, down))
             assert session.viewport.project(middle) == pytest.approx((48, 40), abs=1e-6)
 
 
