@@ -161,7 +161,6 @@ def write_page(record: dict[str, Any]) -> None:
     for name, value in {
         "numbers": markdown_table(["", *columns], rows, left_columns=range(1 + len(columns))),
         "count": len(beef),
-        "unidentified": sum(bool(numbers["not_identifiable"]) for numbers in beef),
         "rejected": sum(numbers["rejected"] for numbers in beef),
     }.items():
         text = text.replace(f"{{{name}}}", str(value))

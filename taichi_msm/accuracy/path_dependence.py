@@ -107,9 +107,7 @@ class PathDependence:
         distance, frame, description = max(self._differences, default=(0.0, 0, ""))
         # A difference above 1 % of the largest displacement means different equilibria.
         if distance > 0.01 * self._largest:
-            remedy = "tissue.pretension, bending or a stiffer foundation"
-            if self._plan.scene.sheet.surface:
-                remedy = "tissue.pretension or a stiffer foundation"
+            remedy = "tissue.pretension, a stiffer foundation, or bending of a flat sheet"
             if self._plan.scene.tissue is None:
                 remedy = "larger springs.virtual"
             yield (
