@@ -259,6 +259,7 @@ def main() -> None:
     IMAGES.mkdir(exist_ok=True)
     animation("press", "press", 320)
     animation("grasp", "grasp", 320)
+    animation("kidney", "kidney", 320)
     endoscope(224)
     four_pixels()
     stereo(0.8, 400)

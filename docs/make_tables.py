@@ -29,7 +29,9 @@ def rows(section: dict[str, Any], definitions: dict[str, Any], prefix: str = "")
     for name, key in section["properties"].items():
         below = list(_references(key))
         default = f"`{json.dumps(key['default'])}`" if key.get("default") is not None else ""
-        if name in section.get("required", ()):
+        # Sections with alternatives begin with the common one.
+        alternatives = [section, *section.get("anyOf", ())[:1]]
+        if any(name in alternative.get("required", ()) for alternative in alternatives):
             default = "**required**"
         elif below and "anyOf" not in key:
             default = "none" if "items" in key else "those below"

@@ -6,26 +6,36 @@ import hashlib
 import io
 import zipfile
 from collections.abc import Callable, Sequence
-from typing import TYPE_CHECKING, Any, NamedTuple
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
 
 from taichi_msm.images import PictureError, actual_path
 from taichi_msm.system.files import read_regular
+from taichi_msm.system.process import available_memory
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
 ARRAY_SUFFIXES = (".npy", ".npz")
 
+# Largest magnitude of a number [m].
+MAX_M = 1e6
+
 # Largest file, and largest array in it [bytes]: 4096 x 4096 points of three float64 numbers, with some margin.
 MAX_BYTES = 2**29
 
 
-class ArrayFile(NamedTuple):
-    """Numbers of a file in metres."""
+# Peak memory of reading a file, in sizes of its array.
+MEMORY_FACTOR = 4
+
+
+@dataclass(frozen=True, eq=False)
+class ArrayFile:
+    """Numbers of a file in metres; equal to itself alone, so that sections of scenes that keep it can be compared."""
 
     values: NDArray[Any]  # float64
     sha256: str  # of the file
-    step: float  # distance of two neighbouring values that the file can hold [m]; 0 for floating-point numbers
+    step: float  # the values are multiples of it, but for an offset [m]; 0 for floating-point numbers
 
 
 def read_array_file(
@@ -42,21 +52,39 @@ def read_array_file(
     except (OSError, ValueError) as error:
         reason = getattr(error, "strerror", None) or str(error)
         raise PictureError(f"{path}: {reason.lower()}", "name an .npy or .npz file that can be read") from None
-    remedy = f"save an array of numbers of shape {shapes} with numpy.save"
+    remedy = f"with numpy.save, save an array of numbers of shape {shapes}"
     try:
         array = _load(path, data, names)
-    except (ValueError, OSError, EOFError, zipfile.BadZipFile, NotImplementedError, RuntimeError):
+    except PictureError:
+        raise
+    except Exception:  # a forged file may raise any type
         raise PictureError(f"{path} is not an .npy or .npz file of numbers", remedy) from None
     if array.dtype.kind not in "fiu":
-        raise PictureError(f"{path}: {array.dtype} is not numeric", remedy)
+        raise PictureError(f"{path} has an array of {array.dtype}", remedy)
     if not is_shape(array.shape) or 0 in array.shape:
-        raise PictureError(f"{path}: shape {array.shape}", remedy)
-    finite = np.isfinite(array)
-    if not finite.all():
-        at = ", ".join(map(str, np.unravel_index(int((~finite).argmax()), array.shape)))
-        raise PictureError(f"{path}: [{at}] is {array[~finite][0]}", "give a finite number there")
-    step = 0.0 if array.dtype.kind == "f" else unit
-    return ArrayFile(array.astype(np.float64) * unit, hashlib.sha256(data).hexdigest(), step)
+        raise PictureError(f"{path} has an array of shape {array.shape}", remedy)
+    values = array.astype(np.float64) * unit
+    # Also NaN is not small.
+    is_small = np.abs(values) <= MAX_M
+    if not is_small.all():
+        at = ", ".join(map(str, np.unravel_index(int((~is_small).argmax()), array.shape)))
+        raise PictureError(f"{path}: [{at}] is {array[~is_small][0]}", f"give finite numbers, of up to {MAX_M:g} m")
+    return ArrayFile(values, hashlib.sha256(data).hexdigest(), unit * quantum(array))
+
+
+def quantum(values: NDArray[Any]) -> float:
+    """Return the greatest common divisor of the differences of integers; 0 for equal and floating-point numbers."""
+    import numpy as np
+
+    return float(np.gcd.reduce(np.diff(np.unique(values).astype(np.int64)))) if values.dtype.kind in "iu" else 0.0
+
+
+def _require_memory(path: str, size: int) -> None:
+    """Raise a PictureError if an array of a size [bytes] needs more memory than is free."""
+    needed, free = MEMORY_FACTOR * size, available_memory()
+    if needed > free:
+        fault = f"{path} needs {needed / 2**20:.3g} MiB of memory, and {free / 2**20:.3g} MiB is free"
+        raise PictureError(fault, "save fewer points")
 
 
 def _load(path: str, data: bytes, names: Sequence[str]) -> NDArray[Any]:
@@ -64,15 +92,19 @@ def _load(path: str, data: bytes, names: Sequence[str]) -> NDArray[Any]:
     import numpy as np
 
     if data[:2] != b"PK":
+        _require_memory(path, len(data))
         array: NDArray[Any] = np.load(io.BytesIO(data), allow_pickle=False)
         return array
     with zipfile.ZipFile(io.BytesIO(data)) as archive:
         members = {info.filename.removesuffix(".npy"): info for info in archive.infolist()}
         name = next((name for name in names if name in members), next(iter(members)) if len(members) == 1 else None)
         if name is None:
-            raise PictureError(f"{path} has {', '.join(sorted(members)[:9])}", f"name one of its arrays {names[0]}")
-        if members[name].file_size > MAX_BYTES:
-            raise PictureError(f"{path}: {name} has {members[name].file_size:,} bytes", f"take at most {MAX_BYTES:,}")
+            present = ", ".join(sorted(members)[:9]) or "no array"
+            raise PictureError(f"{path} has {present}", f"name one of its arrays {names[0]}")
+        size = members[name].file_size
+        if size > MAX_BYTES:
+            raise PictureError(f"{path}: {name} has {size:,} bytes", f"take at most {MAX_BYTES:,}")
+        _require_memory(path, size)
         with archive.open(members[name]) as member:
             array = np.load(io.BytesIO(member.read(MAX_BYTES)), allow_pickle=False)
     return array

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import operator
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from typing import Any, ClassVar
 
 from taichi_msm.arithmetic import NUMPY, Operations, unchanged
@@ -77,20 +79,13 @@ def dual_operations(base: Operations) -> Operations:
 
         return of_dual
 
-    def choose(function: Callable[..., Any], is_first: Callable[..., Any]) -> Callable[..., Any]:
-        """Extend a function that returns one of two numbers."""
-
-        def of_dual(a: Any, b: Any) -> Any:
-            either = a if isinstance(a, Dual) else b
-            if not isinstance(either, Dual):
-                return function(a, b)
-            (value, slope), (other, other_slope) = _parts(a), _parts(b)
-            return either._new(function(value, other), base.where(is_first(value, other), slope, other_slope))
-
-        return of_dual
-
-    def where(condition: Any, a: Any, b: Any) -> Any:
-        return choose(lambda value, other: base.where(condition, value, other), lambda *_: condition)(a, b)
+    def choose(function: Callable[..., Any], is_first: Callable[..., Any], a: Any, b: Any) -> Any:
+        """Apply a function that returns one of two numbers."""
+        either = a if isinstance(a, Dual) else b
+        if not isinstance(either, Dual):
+            return function(a, b)
+        (value, slope), (other, other_slope) = _parts(a), _parts(b)
+        return either._new(function(value, other), base.where(is_first(value, other), slope, other_slope))
 
     return base._replace(
         wrap=unchanged,
@@ -98,9 +93,9 @@ def dual_operations(base: Operations) -> Operations:
         log=lift(base.log, lambda slope, value, _: slope / value),
         arctan=lift(base.arctan, lambda slope, value, _: slope / (1 + value * value)),
         exp=lift(base.exp, lambda slope, _, result: slope * result),
-        maximum=choose(base.maximum, lambda a, b: a > b),
-        minimum=choose(base.minimum, lambda a, b: a < b),
-        where=where,
+        maximum=partial(choose, base.maximum, operator.gt),
+        minimum=partial(choose, base.minimum, operator.lt),
+        where=lambda condition, a, b: choose(partial(base.where, condition), lambda *_: condition, a, b),
     )
 
 

@@ -153,9 +153,7 @@ def out_of_memory(error: Exception) -> str:
     # Taichi puts a source line in brackets before its messages.
     reason = re.sub(r"^\[.*?\] ", "", " ".join(str(error).split())).rstrip(".")
     # Compilers and picture encoders raise a RuntimeError.
-    if isinstance(error, MemoryError) or re.search(
-        r"MemoryError|memory allocation|out of memory", reason, re.IGNORECASE
-    ):
+    if isinstance(error, MemoryError) or re.search(r"(?i)MemoryError|memory allocation|out of memory", reason):
         fault = f"out of memory: {reason}" if reason else "out of memory"
         return f"{fault}; reduce sheet.points or render.size, or raise the limit of memory (ulimit -v)"
     return ""

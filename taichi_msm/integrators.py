@@ -38,7 +38,7 @@ class Integrator(NamedTuple):
     largest_step: Callable[[float, float], float]  # of w and g; stable [s], infinite without stiffness and damping
     order: Callable[[float], int]  # of g; order of the method without contact
     # Largest g h in a stable step with which velocities keep their sign; infinite if they do in every stable step.
-    resolved_damping: float
+    resolved_damping: float = math.inf
 
 
 def _central(m: float, g: float, h: float) -> Coefficients:
@@ -63,7 +63,5 @@ def stability_limit(frequency: float, g: float = 0.0) -> float:
 # By the values of `time.damping_difference`.
 INTEGRATORS = {
     "central": Integrator("of order 2", _central, lambda w, _: stability_limit(w), lambda _: 2, 2.0),
-    "backward": Integrator(
-        "the paper's eq. 3, of order 1", _backward, stability_limit, lambda g: 1 if g > 0 else 2, math.inf
-    ),
+    "backward": Integrator("the paper's eq. 3, of order 1", _backward, stability_limit, lambda g: 1 if g > 0 else 2),
 }

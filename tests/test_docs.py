@@ -11,8 +11,8 @@ import shutil
 import subprocess
 import sys
 from collections.abc import Iterator
+from contextlib import nullcontext
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any, get_type_hints
 
 import numpy as np
@@ -43,7 +43,7 @@ README = ROOT / "README.md"
 DOCS = ROOT / "docs"
 PAGES = [README, ROOT / "CONTRIBUTING.md", ROOT / "CHANGELOG.md", *sorted(DOCS.glob("**/*.md"))]
 # Pages with commands, in an order in which each finds the results that it reads.
-ORDER = "first-scene own-tissue endoscope scene keys labels data-set sweep fit export error view study"
+ORDER = "first-scene own-tissue endoscope surfaces scene keys labels data-set sweep fit export error view study"
 WITH_COMMANDS = [README, *(DOCS / f"{name}.md" for name in ORDER.split())]
 
 # Replacements in the shipped scenes, to run all commands of the pages in little time.
@@ -116,8 +116,7 @@ def small_scenes(device: Device, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
     monkeypatch.setattr(process, "available_threads", lambda: device.threads)
     # All sweeps share one process.
     pool = Pool(1)
-    shared = SimpleNamespace(submit=pool.submit, shutdown=lambda cancel_futures=False: None)
-    monkeypatch.setattr(sweep, "Pool", lambda workers: shared)
+    monkeypatch.setattr(sweep, "Pool", lambda workers: nullcontext(pool))
     yield tmp_path
     pool.shutdown()
 

@@ -10,7 +10,7 @@ Usage: ``python make_mucosa.py [FOLDER]``
 import bisect
 import math
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from itertools import pairwise
 from operator import attrgetter
 from pathlib import Path
@@ -145,7 +145,7 @@ def crowd(taken: Field, point: Point) -> float:
     return float(taken[i - 2 : i + 3, j - 2 : j + 3].sum())
 
 
-def creep(rng: np.random.Generator, start: Point, radius: float, taken: Field) -> tuple[list[Point], bool]:
+def creep(rng: np.random.Generator, start: Point, radius: float, taken: Field, wraps: bool) -> tuple[list[Point], bool]:
     """Let one vessel wind onwards, away from others, while it tapers to ``radius``.
 
     Returns:
@@ -159,6 +159,8 @@ def creep(rng: np.random.Generator, start: Point, radius: float, taken: Field) -
         aim += 0.004 * (left - right) - 0.05 * (aim - start.heading)
         turn = 0.85 * turn + 0.07 * rng.standard_normal() / math.sqrt(start.radius)  # fine ones wind more
         there = here.ahead(STEP, here.heading + turn - 0.1 * (here.heading - aim))
+        if wraps:
+            there = there._replace(x=there.x % CANVAS)
         if not (0 <= there.x < CANVAS and 0 <= there.y < CANVAS):
             return path, True
         path.append(there._replace(radius=start.radius + (radius - start.radius) * step / steps))
@@ -168,18 +170,21 @@ def creep(rng: np.random.Generator, start: Point, radius: float, taken: Field) -
     return path, False
 
 
-def grow(rng: np.random.Generator, entering: int) -> Iterator[list[Point]]:
-    """Yield the vessels of the tree, which branches by Murray's law: the cubes of the radii add up."""
+def grow(rng: np.random.Generator, entering: Iterable[Point], wraps: bool = False) -> Iterator[list[Point]]:
+    """Yield the vessels of the tree, which branches by Murray's law: the cubes of the radii add up.
+
+    With ``wraps``, a vessel that leaves at the left or right comes in again at the other side.
+    """
     taken = np.zeros(((CANVAS + 4 * PROBE) // CELL + 1,) * 2)
     thickness = attrgetter("radius")
-    tips = sorted(trunks(rng, entering), key=thickness)
+    tips = sorted(entering, key=thickness)
     while tips:
         tip = tips.pop()  # the thickest first, so that finer ones fill the room left between them
         share = 0.01 + 0.49 * rng.uniform() ** 2  # mostly small: a vessel gives off twigs on its way
         major, minor = tip.radius * (1 - share) ** (1 / 3), tip.radius * share ** (1 / 3)
         if tip.radius < 0.9 and crowd(taken, tip) > MAX_CROWD:
             major = minor = 0.0
-        path, ended = creep(rng, tip, major if major > FINEST else 0.0, taken)
+        path, ended = creep(rng, tip, major if major > FINEST else 0.0, taken, wraps)
         yield path
         for point in path:
             taken[point.cell] = 1
@@ -226,7 +231,7 @@ def paint(look: Look) -> Image.Image:
     blood = look.blood + look.patches * patches + look.crypts * crypts + 0.03 * valleys
     absorbance = np.multiply.outer(blood, HAEMOGLOBIN) + np.multiply.outer(1 + 0.6 * noise(rng, 70), FAT)
     height = relief + 2.8 * noise(rng, 16) + 0.5 * noise(rng, 6) + 0.5 * crypts
-    vessels = list(grow(rng, look.trunks))
+    vessels = list(grow(rng, trunks(rng, look.trunks)))
     for layer, (_, depth, colour) in enumerate(LAYERS):
         seen = blur(draw(vessels, layer), depth)
         absorbance += np.multiply.outer(seen, colour)

@@ -72,9 +72,8 @@ def choose_companion_runs(plan: Plan, *, requested: bool = False) -> CompanionRu
         # Coarser meshes are compared with the coarse companion run, whose steps are longer.
         cost = (1 + mesh_cost) * coarse / steps
     if not requested and not affords_companions(plan, cost):
-        return CompanionRuns(
-            reason="it would take more than two fifths of the run; to have it anyway, pass --estimate-error"
-        )
+        reason = "it would take more than two fifths of the run; to have it anyway, pass --estimate-error"
+        return CompanionRuns(reason=reason)
     # Without stored positions, a subsequent companion run requires a repetition of the run.
     repetition = 0.0 if plan.scene.output else 1.0
 

@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from taichi_msm.arithmetic import NUMPY
+from taichi_msm.model.crossings import cells_on_line
 from taichi_msm.model.plan import Plan
 from taichi_msm.model.rest import rest_of
 from taichi_msm.model.sheet import rest_positions
@@ -57,13 +58,7 @@ def _pierces(tool: SolidTool, position: NDArray[np.floating], time: float) -> bo
     basis = np.linalg.svd(tool.axis[None])[2]
     basis[0] = tool.axis
     local = (position - tool.path_at(np.array([time]))[0]) @ basis.T
-    # The axis can pass only through cells with corners on both sides of it, in both orthogonal directions.
-    candidates = np.ones([count - 1 for count in position.shape[:2]], dtype=bool)
-    for coordinate in (local[..., 1], local[..., 2]):
-        for side in (coordinate <= 0, coordinate >= 0):
-            pairs = side[:-1] | side[1:]
-            candidates &= pairs[:, :-1] | pairs[:, 1:]
-    i, j = np.nonzero(candidates)
+    i, j = np.nonzero(cells_on_line((local[..., 1], local[..., 2])))
     for corner in (local[i, j + 1], local[i + 1, j]):
         triangle = np.stack([local[i, j], corner, local[i + 1, j + 1]], axis=1)
         x, y = triangle[..., 1], triangle[..., 2]

@@ -90,17 +90,14 @@ class DivergenceMonitor:
         frame, fault = reading.steps // self._grid.steps_per_frame, self._fault(reading, extreme)
         if not fault:
             least_energy, growth = self._energy_growth(reading, frame)
-            pierced_by, pierced_frame = progress.pierced_by, progress.pierced_frame
-            if not pierced_by:
-                pierced_by = first_piercing_probe(self._plan, reading.displacement, frame)
-                pierced_frame = frame if pierced_by else 0
+            is_largest = extreme.distance > progress.max_displacement
+            pierced_by = progress.pierced_by or first_piercing_probe(self._plan, reading.displacement, frame)
+            is_first_piercing = pierced_by and not progress.pierced_by
             height = heights(reading.displacement, self._plan.scene.sheet)
             self.progress = RunProgress(
                 frame=frame,
                 max_displacement=max(progress.max_displacement, extreme.distance),
-                max_displacement_frame=(
-                    frame if extreme.distance > progress.max_displacement else progress.max_displacement_frame
-                ),
+                max_displacement_frame=frame if is_largest else progress.max_displacement_frame,
                 shortest_spring=min(progress.shortest_spring, reading.shortest_spring),
                 longest_spring=max(progress.longest_spring, reading.longest_spring),
                 energy=reading.energy,
@@ -113,7 +110,7 @@ class DivergenceMonitor:
                 least_energy=least_energy,
                 energy_growth=growth,
                 pierced_by=pierced_by,
-                pierced_frame=pierced_frame,
+                pierced_frame=frame if is_first_piercing else progress.pierced_frame,
             )
         return fault
 
@@ -121,10 +118,8 @@ class DivergenceMonitor:
         """Return the smallest energy of a frame after the last load [J], 0 until then, and the largest growth."""
         least, growth = self.progress.least_energy, self.progress.energy_growth
         # Stress relaxation returns energy, so growth is not an error.
-        if (
-            self._plan.material.relaxation
-            or frame / self._grid.frames_per_second < _release_time(self._plan) + self._grid.step
-        ):
+        time, release = frame / self._grid.frames_per_second, _release_time(self._plan) + self._grid.step
+        if self._plan.material.relaxation or time < release:
             return least, growth
         displacement = reading.displacement.astype(np.float64)
         energy = reading.energy + foundation_energy(self._plan, self._lasting_stiffness, displacement)

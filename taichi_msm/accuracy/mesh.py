@@ -29,7 +29,7 @@ With `springs`, a sheet with another mesh is a different sheet, so its error is 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import lru_cache, partial
 from itertools import product
@@ -44,6 +44,7 @@ from taichi_msm.errors import DivergedError, Pause, ProgressCallback, SceneError
 from taichi_msm.model.plan import Plan
 from taichi_msm.model.rest import rest_of
 from taichi_msm.model.sheet import MAX_CELL_ASPECT, Maps, cell_aspect_ratio
+from taichi_msm.model.surface_checks import surface_problems
 from taichi_msm.model.tool_force import sum_probe_forces
 from taichi_msm.model.tools import overlap, solid_tools
 from taichi_msm.scene.scene import Scene
@@ -96,7 +97,7 @@ class MeshEstimate:
 def coarser_plan(plan: Plan, ratio: float = 0.5) -> Plan | None:
     """Plan the scene on a mesh with a ratio of the cells per side, and with the same total forces.
 
-    Return None without tissue, with too few mass points, or with cells beyond the largest aspect ratio.
+    Return None without tissue, with too few mass points, or with cells that are not allowed.
     """
     scene = plan.scene
     if scene.tissue is None or min(scene.sheet.points) < MIN_POINTS_PER_SIDE:
@@ -105,13 +106,12 @@ def coarser_plan(plan: Plan, ratio: float = 0.5) -> Plan | None:
     if ratio == SECOND_CELL_RATIO:
         # Numbers of cells with the parity of the plan's, so that both meshes have a mass point in the middle, under a
         # tool, or neither has.
-        cells = [
-            count - 1 - 2 * round((count - 1 - few) / 2) for count, few in zip(scene.sheet.points, cells, strict=True)
-        ]
+        pairs = zip(scene.sheet.points, cells, strict=True)
+        cells = [count - 1 - 2 * round((count - 1 - few) / 2) for count, few in pairs]
     # Numbers of cells are rounded up or down, to keep the aspect ratio of the cells below its limit.
     options = product(*({math.ceil(count) + 1, math.floor(count) + 1} for count in cells))
     scenes = [with_points(scene, (rows, cols)) for rows, cols in options]
-    valid = [option for option in scenes if cell_aspect_ratio(option.sheet) <= MAX_CELL_ASPECT]
+    valid = [option for option in scenes if _allows_cells(option)]
     if not valid:
         return None
 
@@ -121,6 +121,12 @@ def coarser_plan(plan: Plan, ratio: float = 0.5) -> Plan | None:
     coarse = min(valid, key=lambda option: (deviation(option), option.sheet.points))
     probes = tuple(_with_equal_force(probe, scene.sheet, coarse.sheet) for probe in scene.probes)
     return plan_variant(plan, coarse.model_copy(update={"probes": probes}))
+
+
+def _allows_cells(scene: Scene) -> bool:
+    if scene.sheet.surface:
+        return not any(surface_problems(scene))
+    return cell_aspect_ratio(scene.sheet) <= MAX_CELL_ASPECT
 
 
 def mesh_companion_plan(plan: Plan) -> Plan | None:
@@ -138,18 +144,15 @@ def _with_equal_force(probe: Probe, sheet: Sheet, coarse: Sheet) -> Probe:
     return probe.with_force(force / coarse_force)
 
 
-def _sampling_force_error(scene: Scene) -> float:
+def _sampling_force_error(probes: Sequence[Probe], sheet: Sheet) -> float:
     """Return the largest relative difference between a tool's force on the mesh and on a much finer mesh."""
     # The force of a tool is summed over at most 4 million mass points, of a curved sheet, which is kept, over fewer.
-    max_points = 4_000_000 if scene.sheet.surface is None else 250_000
-    refinement = min(8, math.isqrt(max_points // math.prod(scene.sheet.points)))
+    max_points = 4_000_000 if sheet.surface is None else 250_000
+    refinement = min(8, math.isqrt(max_points // math.prod(sheet.points)))
     if refinement < 2:
         return 0.0  # With cells this small, no tool is as narrow as a cell.
-    probes = [probe for probe in scene.probes if probe.total is not None]
-    pairs = [
-        (sum_probe_forces(probe, scene.sheet)[0], sum_probe_forces(probe, scene.sheet, refinement)[0])
-        for probe in probes
-    ]
+    pushing = [probe for probe in probes if probe.total is not None]
+    pairs = [(sum_probe_forces(probe, sheet)[0], sum_probe_forces(probe, sheet, refinement)[0]) for probe in pushing]
     return max((abs(force / fine_force - 1) for force, fine_force in pairs if fine_force > 0), default=0.0)
 
 
@@ -178,7 +181,7 @@ class MeshCompanion:
         # Cells of the run per cell of the first companion run, along a side.
         self._ratio = min((count - 1) / (fewer - 1) for count, fewer in points)
         self._differences = [0.0 for _ in plans]
-        self._sampling_error = _sampling_force_error(plan.scene)
+        self._sampling_error = _sampling_force_error(plan.scene.probes, plan.scene.sheet)
         self._contact, self._grips = plan.has_contact, any(tool.grips for tool in plan.tools)
         cell = rest_of(plan.scene.sheet).longest_side
         narrow = [tool for tool in solid_tools(plan.tools).values() if tool.radius < MIN_RADIUS_CELLS * cell]

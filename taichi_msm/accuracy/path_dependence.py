@@ -42,11 +42,9 @@ class PathDependence:
 
     def __init__(self, plan: Plan) -> None:
         self._plan = plan
-        self._loads = [
-            (FrameLoad(probe, plan.scene.sheet), max(abs(percent) for _, percent in probe.load) or 1.0)
-            for probe in plan.scene.probes
-            if not probe.moved
-        ]
+        pushing = [probe for probe in plan.scene.probes if not probe.moved]
+        peaks = [max(abs(percent) for _, percent in probe.load) or 1.0 for probe in pushing]
+        self._loads = [(FrameLoad(probe, plan.scene.sheet), peak) for probe, peak in zip(pushing, peaks, strict=True)]
         # Frames, as a pair of number and displacements: the previous one, the one with the largest displacement, and
         # the first one after that with less than half of it.
         self._previous: tuple[int, Array] | None = None
@@ -110,6 +108,8 @@ class PathDependence:
         # A difference above 1 % of the largest displacement means different equilibria.
         if distance > 0.01 * self._largest:
             remedy = "tissue.pretension, bending or a stiffer foundation"
+            if self._plan.scene.sheet.surface:
+                remedy = "tissue.pretension or a stiffer foundation"
             if self._plan.scene.tissue is None:
                 remedy = "larger springs.virtual"
             yield (
@@ -131,9 +131,8 @@ def second_solution(plan: Plan, frame: int, device: Device, cores: int | None, p
         return None
     probes = tuple(_load_at_once(plan, probe, frame) for probe in scene.probes)
     time = scene.time.model_copy(update={"duration": 1.0, "frames_per_second": 1})
-    sheet = build_solver(
-        plan_variant(plan, scene.model_copy(update={"probes": probes, "time": time})), device, cores=cores
-    )
+    variant = plan_variant(plan, scene.model_copy(update={"probes": probes, "time": time}))
+    sheet = build_solver(variant, device, cores=cores)
     try:
         sheet.advance(1, pause)
         return sheet.displacement()

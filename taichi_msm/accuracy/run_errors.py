@@ -216,9 +216,8 @@ def run_warnings(
     scene, grid = plan.scene, plan.grid
     time_step, reason, mesh, force = errors
     if time_step is not None or mesh is not None:
-        yield _error_line(time_step, mesh, progress.max_displacement, scale) + (
-            "; mesh error unknown: another number of points is another sheet" if scene.tissue is None else ""
-        )
+        unknown = "; mesh error unknown: another number of points is another sheet" if scene.tissue is None else ""
+        yield _error_line(time_step, mesh, progress.max_displacement, scale) + unknown
     if time_step is not None:
         if REMEDY_THRESHOLD < time_step.error < math.inf and not time_step.separate:
             yield "--estimate-error separates the errors of the time step and of rounding"
@@ -320,9 +319,9 @@ def _digits(number: float, digits: int = 1) -> str:
 def _mesh_remedy(plan: Plan, mesh: MeshEstimate, affords: Callable[[Plan], bool]) -> str:
     """Suggest a remedy for the mesh error: a finer mesh with at most `MAX_POINTS_RATIO` times the mass points."""
     if mesh.doubt == WRINKLING:
-        return (
-            "hold every side and set tissue.bending or tissue.pretension; without them, a finer mesh has finer wrinkles"
-        )
+        # A curved sheet has no bending.
+        remedies = "tissue.pretension" if plan.scene.sheet.surface else "tissue.bending or tissue.pretension"
+        return f"hold every side and set {remedies}; otherwise a finer mesh has finer wrinkles"
     refinement = min(math.sqrt(mesh.error / (REMEDY_THRESHOLD / 2)), math.sqrt(MAX_POINTS_RATIO))
     rows, cols = (math.ceil((count - 1) * refinement) + 1 for count in plan.scene.sheet.points)
     if max(rows, cols) < MAX_POINTS and affords(plan_variant(plan, with_points(plan.scene, (rows, cols)))):

@@ -11,7 +11,13 @@ from typing_extensions import TypedDict
 from taichi_msm.model.cells import cell_stiffness
 from taichi_msm.model.plan import Plan
 from taichi_msm.model.rest import CurvedRest, rest_of
-from taichi_msm.model.surface_checks import describe_place, isotropy_remedy, neighbour_angles
+from taichi_msm.model.surface_checks import (
+    FOLD_REMEDY,
+    describe_fold,
+    describe_largest,
+    isotropy_remedy,
+    neighbour_angles,
+)
 from taichi_msm.scene.scene import Scene
 from taichi_msm.terms import fictitious_masses
 from taichi_msm.terms.elasticity import spring_families
@@ -32,7 +38,7 @@ class SurfaceRecord(TypedDict):
 
     kind: str
     sha256: str | None  # of the file
-    sides: list[float]  # shortest and longest mean side of a cell [m]
+    sides: list[float]  # shortest and longest side of a cell [m]
     isotropy_error: IsotropyRecord
     clamped: int  # number of cells with a spring whose stiffness would be negative
     filled: float  # share of pixels without depth
@@ -62,18 +68,17 @@ def surface_notes(scene: Scene) -> Iterator[str]:
     isotropy, file, side = record["isotropy_error"], surface.file, min(rest.cell_sides)
     if scene.tissue is not None and isotropy["mean"] > NOTED_ISOTROPY_ERROR:
         yield (
-            f"sheet.surface: the springs deviate from isotropic tissue by {isotropy['mean']:.3g} on the mean, up to "
-            f"{isotropy['worst']:.3g}; {isotropy_remedy(rest)}"
+            f"sheet.surface: the springs deviate from isotropic tissue by {isotropy['mean']:.2g} on the mean, up to "
+            f"{isotropy['worst']:.2g}; {isotropy_remedy(rest, surface.kind)}"
         )
     if surface.height and file and file.step > NOTED_STEP * side:
         yield (
             f"sheet.surface: heights in steps of {file.step:.3g} m, over a twentieth of a cell's side, {side:.3g} m; "
-            "take a picture of 16 bits or an array"
+            "take a picture of 16 bits, or an array of floating-point numbers"
         )
     angles = neighbour_angles(rest.cell_normals)
-    if (angle := float(angles.max())) > NOTED_ANGLE_DEGREES:
-        place = describe_place(angles == angle)
-        yield f"sheet.surface: cells at {place} meet at {angle:.0f} degrees; take more points, or a smoother surface"
+    if angles.max() > NOTED_ANGLE_DEGREES:
+        yield f"sheet.surface: {describe_fold(angles)}; {FOLD_REMEDY}"
 
 
 def describe_surface(plan: Plan) -> Iterator[str]:
@@ -83,16 +88,15 @@ def describe_surface(plan: Plan) -> Iterator[str]:
         return
     cells, (rows, cols) = rest.cells, plan.scene.sheet.points
     aspect = np.maximum(cells.side_a / cells.side_b, cells.side_b / cells.side_a)
-    angles, isotropy = np.degrees(np.arccos(cells.cosine)), record["isotropy_error"]
+    angles = np.degrees(np.arccos(cells.cosine))
+    low, high = f"{angles.min():.0f}", f"{angles.max():.0f}"
     yield (
         f"surface: {record['kind']}, {rows} x {cols} points, cells of {rest.shortest_side:.3g} to "
-        f"{rest.longest_side:.3g} m, at most {aspect.max():.3g} times as long as wide, at {angles.min():.0f} to "
-        f"{angles.max():.0f} degrees"
+        f"{rest.longest_side:.3g} m, at most {aspect.max():.3g} times as long as wide, with sides at "
+        f"{low if low == high else f'{low} to {high}'} degrees"
     )
-    worst = describe_place(rest.isotropy_errors == rest.isotropy_errors.max())
-    line = f"surface: isotropy error {isotropy['mean']:.3g} on the mean, at most {isotropy['worst']:.3g}, at {worst}"
-    clamped = record["clamped"]
-    yield f"{line}; {clamped} cells are clamped, as a spring would need a stiffness below 0" if clamped else line
+    if plan.scene.tissue is not None:
+        yield _describe_isotropy(rest, record)
     if not plan.scene.time.at_rest:
         squares = fictitious_masses(plan.material, plan.scene.sheet)
         if plan.material.by_area:
@@ -108,3 +112,13 @@ def describe_surface(plan: Plan) -> Iterator[str]:
         pressures = np.abs((pulls * rest.point_normals).sum(axis=-1)) / rest.areas
         largest = float(pressures[~plan.fixed].max(initial=0.0))
         yield f"surface: at rest, a pressure of up to {largest:.4g} Pa holds the pretension"
+
+
+def _describe_isotropy(rest: CurvedRest, record: SurfaceRecord) -> str:
+    isotropy, clamped, line = record["isotropy_error"], record["clamped"], "surface: isotropy error 0"
+    # Rectangles and rhombi are exact but for rounding.
+    if isotropy["worst"] > 1e-9:
+        place = describe_largest(rest.isotropy_errors)
+        line = f"surface: isotropy error {isotropy['mean']:.2g} on the mean, {isotropy['worst']:.2g} at {place}"
+    count = f"{clamped} cells are" if clamped > 1 else "a cell is"
+    return f"{line}; {count} clamped, as a spring would need a stiffness below 0" if clamped else line

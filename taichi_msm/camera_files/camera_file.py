@@ -26,10 +26,8 @@ MAX_DEPTH = 20
 MAX_DIGITS = 1000
 
 # Errors of Python's and PyYAML's parsers for invalid content.
-_PARSER_ERRORS = (
-    *(ArithmeticError, AttributeError, LookupError, RecursionError, SyntaxError, TypeError, ValueError),
-    yaml.YAMLError,
-)
+_PYTHON_ERRORS = ArithmeticError, AttributeError, LookupError, RecursionError, SyntaxError, TypeError, ValueError
+_PARSER_ERRORS = (*_PYTHON_ERRORS, yaml.YAMLError)
 
 
 class Entries(dict[str, Any]):
@@ -160,14 +158,9 @@ class _Loader(_BaseLoader):  # type: ignore[misc]
 
 
 def _mapping(loader: _Loader, node: yaml.MappingNode) -> Entries:
-    return build_entries(
-        (
-            loader.construct_object(name, deep=True),
-            loader.construct_object(value, deep=True),
-            name.start_mark.line + 1,
-        )
-        for name, value in node.value
-    )
+    pairs = [[loader.construct_object(item, deep=True) for item in pair] for pair in node.value]
+    lines = (name.start_mark.line + 1 for name, _ in node.value)
+    return build_entries((name, value, line) for (name, value), line in zip(pairs, lines, strict=True))
 
 
 for _kind in ("opencv-matrix", "opencv-nd-matrix", "map"):

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import re
 from collections.abc import Sequence
-from typing import NamedTuple
 
 from taichi_msm.camera_files.calibration import CalibrationReader
 from taichi_msm.camera_files.camera_file import CameraFile, Entries, listed
@@ -71,12 +70,11 @@ def _read_images(file: CameraFile) -> Trajectory | None:
     images, follows_image = [], False
     for n, line in lines:
         if (image := _image(line)) is not None:
-            images.append((image.name, n, image.pose, image.camera))
+            name, pose, camera = image
+            images.append((name, n, pose, camera))
         elif not (follows_image and _has_points(line.split())):
-            raise file.fault(
-                "neither an image, IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME, nor points; export the model again",
-                n,
-            )
+            fault = "neither an image, IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME, nor points"
+            raise file.fault(f"{fault}; export the model again", n)
         follows_image = image is not None
     if len(cameras := {camera for *_, camera in images}) > 1:
         raise file.fault(f"has images of cameras {listed(sorted(cameras))}; keep those of one")
@@ -95,24 +93,19 @@ def _read_images(file: CameraFile) -> Trajectory | None:
             raise file.fault(fault, n)
         inverse = Rotation.from_quat((x, y, z, w)).inv()
         poses.append((n, [number, *(-inverse.apply(translation)).tolist(), *inverse.as_quat().tolist()]))
-    return Trajectory([row for _, row in poses], [n for n, _ in poses], has_times)
+    return Trajectory(poses, has_times)
 
 
-class _Image(NamedTuple):
-    """Line of images.txt."""
+def _image(line: str) -> tuple[str, list[float], str] | None:
+    """Return name, pose (quaternion w, x, y, z and translation, from the world to the camera), and camera of an image.
 
-    pose: list[float]  # quaternion w, x, y, z and translation, from the world to the camera
-    camera: str
-    name: str
-
-
-def _image(line: str) -> _Image | None:
-    """Split the line of an image, which, unlike a line of points, does not end with a number."""
+    The line of an image, unlike one of points, does not end with a number.
+    """
     words = line.split(maxsplit=9)
     pose = parse_numbers(words[1:8])
     if pose is None or len(words) < 10 or not (words[0].isdecimal() and words[8].isdecimal()):
         return None
-    return None if parse_numbers(line.split()[-1:]) else _Image(pose, words[8], words[9])
+    return None if parse_numbers(line.split()[-1:]) else (words[9], pose, words[8])
 
 
 def _has_points(words: Sequence[str]) -> bool:

@@ -37,11 +37,8 @@ def _pose(keys: Keys) -> StereoPose | None:
 
 def _is_camera(section: Any) -> TypeGuard[Entries]:
     """Return whether a section has a model and a list of intrinsics; nine numbers are a matrix of another format."""
-    return (
-        isinstance(section, Entries)
-        and "camera_model" in section
-        and len(flat(section.get("intrinsics"))) not in (1, 9)
-    )
+    has_model = isinstance(section, Entries) and "camera_model" in section
+    return has_model and len(flat(section.get("intrinsics"))) not in (1, 9)
 
 
 def _camera(file: CameraFile, prefix: str, section: Entries) -> Keys:

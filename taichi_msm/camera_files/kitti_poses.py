@@ -30,7 +30,7 @@ def _read(file: CameraFile) -> Trajectory | None:
         raise file.fault(fault, lines[int(faults.argmax())][0])
     quaternions = Rotation.from_matrix(rotations).as_quat()
     rows = np.column_stack([np.arange(len(poses)), matrices[:, :, 3], quaternions]).tolist()
-    return Trajectory(rows, [n for n, _ in lines], has_times=False)
+    return Trajectory([(n, row) for (n, _), row in zip(lines, rows, strict=True)], has_times=False)
 
 
 KITTI = TrajectoryReader("KITTI", "lines of twelve numbers, without a header; needs `poses_rate`", _read)

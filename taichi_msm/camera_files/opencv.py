@@ -124,10 +124,9 @@ def _require_agreement(keys: Keys, focal: Sequence[float], centre: Sequence[floa
     expected |= {f"focal(length)?s?{'' if is_matrix else '|f'}": focal, "principalpoint|pp|centre|center": centre}
     for spelling, values in expected.items():
         numbers = keys.numbers(spelling)
-        if numbers and not all(
-            math.isclose(a, b, rel_tol=ROUNDING_TOLERANCE) for a, b in zip(numbers, values, strict=False)
-        ):
-            names, found = listed(keys.values(spelling)), ", ".join(f"{number:g}" for number in numbers)
+        pairs = zip(numbers or (), values, strict=False)
+        if not all(math.isclose(a, b, rel_tol=ROUNDING_TOLERANCE) for a, b in pairs):
+            names, found = listed(keys.values(spelling)), ", ".join(f"{number:g}" for number in numbers or ())
             raise keys.fault(f"{names}: {found} differs from the camera matrix; keep one", keys.find(spelling))
 
 

@@ -79,7 +79,7 @@ def read_poses(path: str, keys: PoseKeys = PoseKeys()) -> tuple[tuple[float, ...
     scale = LENGTH_UNITS[_agreed_unit(file, "poses_unit", keys.poses_unit, trajectory.length_unit) or "m"]
     times = _times(file, trajectory, keys)
     rows: list[tuple[float, ...]] = []
-    for n, time, (_, x, y, z, *quaternion) in zip(trajectory.lines, times, trajectory.rows, strict=True):
+    for time, (n, (_, x, y, z, *quaternion)) in zip(times, trajectory.rows, strict=True):
         row = (time, scale * x, scale * y, scale * z, *quaternion)
         if fault := pose_fault(row, rows[-1] if rows else None):
             raise file.fault(fault, n)
@@ -89,7 +89,7 @@ def read_poses(path: str, keys: PoseKeys = PoseKeys()) -> tuple[tuple[float, ...
 
 def _times(file: CameraFile, trajectory: Trajectory, keys: PoseKeys) -> list[float]:
     """Return the time of every pose in the scene [s]."""
-    numbers = [row[0] for row in trajectory.rows]
+    numbers = [row[0] for _, row in trajectory.rows]
     if not trajectory.has_times:
         if keys.poses_rate is None or keys.poses_time is not None:
             in_place = "" if keys.poses_time is None else ", in place of poses_time"

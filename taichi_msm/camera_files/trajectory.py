@@ -20,10 +20,9 @@ COLUMNS = ("t", "tx", "ty", "tz", "qx", "qy", "qz", "qw")
 class Trajectory(NamedTuple):
     """Poses of a camera, in the units of the file."""
 
-    # Time (or the number of the picture, without times), position x, y, z and quaternion x, y, z, w, from the camera to
-    # the world.
-    rows: Sequence[Sequence[float]]
-    lines: Sequence[int]  # numbers of the lines of the rows, for messages
+    # Number of the line, for messages; time (or the number of the picture, without times), position x, y, z and
+    # quaternion x, y, z, w, from the camera to the world.
+    rows: Sequence[tuple[int, Sequence[float]]]
     has_times: bool  # whether the file contains times
     time_unit: str | None = None  # unit of times in the header; None without one
     length_unit: str | None = None  # unit of lengths in the header; None without one

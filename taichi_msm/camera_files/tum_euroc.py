@@ -48,8 +48,7 @@ TUM = _Columns(tuple(range(8)), 8)
 
 def _read(file: CameraFile) -> Trajectory:
     """Read the rows; without a header, the columns are TUM's."""
-    rows: list[list[float]] = []
-    lines = []
+    rows: list[tuple[int, list[float]]] = []
     columns = None
     for n, line in file.lines:
         text, _, comment = line.replace('"', "").partition("#")
@@ -64,10 +63,9 @@ def _read(file: CameraFile) -> Trajectory:
             fault = f"a comment states another convention, {truncate(match[0])}"
             raise file.fault(f"{fault}; name the columns in the first line: # {', '.join(COLUMNS)}", n)
         elif words:
-            rows.append(_row(file, n, words, columns, separated="," in text))
-            lines.append(n)
+            rows.append((n, _row(file, n, words, columns, separated="," in text)))
     columns = columns or TUM
-    return Trajectory(rows, lines, True, columns.time_unit, columns.length_unit)
+    return Trajectory(rows, True, columns.time_unit, columns.length_unit)
 
 
 def _header(text: str, *, is_comment: bool) -> list[str]:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import shlex
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import closing, contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -80,7 +80,7 @@ def show_progress(interruption: Interruption, quiet: bool) -> Iterator[Callable[
         if stage != "write":
             interruption.raise_if_requested()
 
-    with ProgressDisplay(quiet=quiet) as bar:
+    with closing(ProgressDisplay(quiet=quiet)) as bar:
         yield progress
 
 

@@ -50,6 +50,7 @@ class ProgressDisplay:
         self._pace = _Pace("", 0, 0.0)
         if self._bar is not None:
             self._task = self._bar.add_task(STAGES["start"], total=None, left="")
+            self._bar.start()
 
     def update(self, stage: str, done: int, total: int) -> None:
         """Show the progress of a stage of `STAGES` and its estimated remaining time; a total of 0 is unknown."""
@@ -67,12 +68,8 @@ class ProgressDisplay:
             count = f": {done} of {total} done" if total else ""
             write_stderr([f"{STAGES[stage]}{count}{remaining and f', about {remaining}'}"])
 
-    def __enter__(self) -> ProgressDisplay:
-        if self._bar is not None:
-            self._bar.start()
-        return self
-
-    def __exit__(self, *_: object) -> None:
+    def close(self) -> None:
+        """Remove the bar."""
         if self._bar is not None:
             self._bar.stop()
 

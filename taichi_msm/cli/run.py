@@ -31,9 +31,7 @@ if TYPE_CHECKING:
 @click.option("--again", metavar="DIR", help="Repeat the run of DIR/run.json instead of running SCENE.")
 @options.quiet_option
 @options.json_option
-@click.pass_context
 def run(
-    context: click.Context,
     scene: str | None,
     out: str | None,
     image: str | None,
@@ -50,13 +48,13 @@ def run(
     overrides += () if quality is None else (f"render.quality={quality}",)
     recorded = [*overrides, *([f"image={image}"] if image is not None else [])]
     if resume is not None:
-        _require_no_settings(context, "--resume continues", ("resume", "threads", "quiet", "as_json"))
+        _require_no_settings("--resume continues", ("resume", "threads", "quiet", "as_json"))
         directory = common.result_directory(resume, option="--resume")
         if not common.resume_hint(directory):
             raise click.BadParameter(f"there is no unfinished run in {resume}", param_hint="--resume")
     elif again is not None:
         allowed = ("again", "out", "arch", "threads", "estimate_error", "quiet", "as_json")
-        _require_no_settings(context, "--again repeats", allowed)
+        _require_no_settings("--again repeats", allowed)
         from taichi_msm.load.check import check_scene
         from taichi_msm.runs.finished import read_run
 
@@ -100,8 +98,9 @@ def run(
     return common.EXIT_CODES.get(record["status"], interruption.code)
 
 
-def _require_no_settings(context: click.Context, action: str, allowed: Sequence[str]) -> None:
+def _require_no_settings(action: str, allowed: Sequence[str]) -> None:
     """Raise a UsageError for an option that the settings of an earlier run determine."""
+    context = click.get_current_context()
     for option in context.command.params:
         is_given = context.get_parameter_source(str(option.name)) is click.core.ParameterSource.COMMANDLINE
         if is_given and option.name not in allowed:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -104,6 +103,7 @@ def view(
 ) -> int:
     """Press the tissue of SCENE with the mouse or a finger, on a page in a browser."""
     from taichi_msm.load.scene_file import load_scene
+    from taichi_msm.view.origin import parse_origin
 
     if seconds is not None and record is None:
         raise click.UsageError("--seconds N needs --record FILE")
@@ -115,7 +115,9 @@ def view(
         raise click.BadParameter("nan is not a number of seconds", param_hint="--seconds")
     film = None if record is None else _film_path(record)
     for origin in origins:
-        _require_origin(origin)
+        if parse_origin(origin) is None:
+            expected = "give only the scheme, host and port of the page, as https://hub.example.org"
+            raise click.BadParameter(f"{truncate(origin)} is not an origin; {expected}", param_hint="--origin")
     loaded = load_scene(scene, overrides, image)
     directory = common.result_directory(out, f"{Path(scene).stem}-live")
 
@@ -140,14 +142,26 @@ def view(
             common.report_interruption(interruption, False, lambda: "; no film was written" if seconds else ""),
             common.prefix_errors(scene),
         ):
-            if film is None or seconds is None:
-                _serve(begin, scene, port, origins, film, interruption)
-                return common.DONE
-            with begin() as live, common.show_progress(interruption, quiet=False) as progress:
-                events = schedule_events(loaded_script, live.frame_rate, loaded.render.size) if loaded_script else ()
-                record_film(live, film, seconds, events, partial(progress, "film"), notices.append)
-            click.echo(printable(str(film)))
-            return common.DIVERGED if live.divergence_error else common.DONE
+            if film is not None and seconds is not None:
+                with begin() as live, common.show_progress(interruption, quiet=False) as progress:
+                    rate, size = live.frame_rate, loaded.render.size
+                    events = schedule_events(loaded_script, rate, size) if loaded_script else ()
+                    record_film(live, film, seconds, events, partial(progress, "film"), notices.append)
+                click.echo(printable(str(film)))
+                return common.DIVERGED if live.divergence_error else common.DONE
+
+            import asyncio
+
+            from taichi_msm.view.server import Server, listen
+
+            with listen(port) as listener, begin() as live:
+                server = Server(live, listener, scene, origins, lambda line: write_stderr([line]))
+                if film is not None:
+                    live.start_film(film)
+                click.echo(server.url)
+                write_stderr(["open this address in a browser; Ctrl-C ends the session"])
+                asyncio.run(server.run(interruption.raise_if_requested))
+            return common.DONE
     finally:
         write_stderr(notices)
         for path in captures.saved:
@@ -167,34 +181,3 @@ def _film_path(record: str) -> Path:
     if path.is_dir():
         raise FilesError(f"{path}: a directory; choose another --record")
     return path
-
-
-def _require_origin(text: str) -> None:
-    """Raise a BadParameter unless a text is an origin."""
-    from taichi_msm.view.origin import parse_origin
-
-    if parse_origin(text) is None:
-        expected = "give only the scheme, host and port of the page, as https://hub.example.org"
-        raise click.BadParameter(f"{truncate(text)} is not an origin; {expected}", param_hint="--origin")
-
-
-def _serve(
-    begin: Callable[[], Session],
-    title: str,
-    port: int,
-    origins: tuple[str, ...],
-    film: Path | None,
-    interruption: Interruption,
-) -> None:
-    """Serve a session to browsers until it ends."""
-    import asyncio
-
-    from taichi_msm.view.server import Server, listen
-
-    with listen(port) as listener, begin() as live:
-        server = Server(live, listener, title, origins, lambda line: write_stderr([line]))
-        if film is not None:
-            live.start_film(film)
-        click.echo(server.url)
-        write_stderr(["open this address in a browser; Ctrl-C ends the session"])
-        asyncio.run(server.run(interruption.raise_if_requested))

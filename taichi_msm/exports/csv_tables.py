@@ -65,7 +65,6 @@ def _write_tracks(run: FinishedRun, number: str, file: TextIO) -> None:
     count, formats = len(pixels), ["%d", *[FLOAT32_FORMAT] * 4, "%d", *[FLOAT32_FORMAT] * 3]
     for frame, time in enumerate(run.time.tolist()):
         line = f"{number},{time!r},{','.join(formats)}\n"
-        rows = np.column_stack(
-            [np.arange(count), coordinates, pixels[:, frame], occluded[:, frame], position[:, frame]]
-        )
+        moving = pixels[:, frame], occluded[:, frame], position[:, frame]
+        rows = np.column_stack([np.arange(count), coordinates, *moving])
         file.write(((line * count) % tuple(rows.ravel().tolist())).replace("nan", ""))

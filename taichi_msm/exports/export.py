@@ -168,11 +168,8 @@ def _write_export(
         written = sorted(list_files(publication.new_folder, PATTERNS, strict=True))
         write_new_file(publication.new_folder / RECORD, (json.dumps({"files": written}, indent=1) + "\n").encode())
         publication.publish([*written, RECORD])
-    return Exported(
-        directory,
-        written,
-        [_name_runs(note, directories) if is_numbered else note for note, directories in notes.items()],
-    )
+    named = [_name_runs(note, directories) if is_numbered else note for note, directories in notes.items()]
+    return Exported(directory, written, named)
 
 
 def _report_progress(progress: ProgressCallback, before: int, frames: int, total: int, done: int, parts: int) -> None:

@@ -59,12 +59,9 @@ def _write_run(run: FinishedRun, training: Path, first: int, progress: ProgressC
         if run.has_output("png"):
             for number in (0, 1):
                 write_new_file(image_2 / f"{name}_1{number}.png", read_picture_file(run, "png", pair + number))
+    missing = {name: OUTPUTS[key].result for name, key in SOURCE_OUTPUTS.items() if not run.has_output(key)}
     remedy = run.remedy("occlusion", "png")
-    return [
-        f"{name} is left out, as the results have no {OUTPUTS[key].result}; {remedy}"
-        for name, key in SOURCE_OUTPUTS.items()
-        if not run.has_output(key)
-    ]
+    return [f"{name} is left out, as the results have no {result}; {remedy}" for name, result in missing.items()]
 
 
 def encode_flow(flow: NDArray[np.float32], visible: NDArray[np.bool_] | None = None) -> NDArray[np.uint16]:

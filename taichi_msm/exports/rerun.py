@@ -61,11 +61,8 @@ def _write_run(run: FinishedRun, path: Path, progress: ProgressCallback) -> list
         recording.flush()
         recording.disconnect()
     camera_runs = _camera_runs(run).values()
-    missing = [
-        key
-        for key in FORMATS["rerun"].optional_outputs
-        if not any(camera_run.has_output(key) for camera_run in camera_runs)
-    ]
+    optional = FORMATS["rerun"].optional_outputs
+    missing = [key for key in optional if not any(camera_run.has_output(key) for camera_run in camera_runs)]
     notes = [f"the results have no {key}; {run.remedy(key)}" for key in missing]
     if any(view_at(run.scene, 0.0, camera_run.camera).lens is not None for camera_run in camera_runs):
         notes.append(
@@ -86,10 +83,8 @@ def _camera_runs(run: FinishedRun) -> dict[str, FinishedRun]:
 
 def _log_run(run: FinishedRun, recording: Any, progress: ProgressCallback) -> None:
     positions, camera_runs = run.positions(), _camera_runs(run)
-    tracks = next(
-        (read_track_positions(camera_run)[1] for camera_run in camera_runs.values() if camera_run.has_output("tracks")),
-        None,
-    )
+    tracked = [camera_run for camera_run in camera_runs.values() if camera_run.has_output("tracks")]
+    tracks = read_track_positions(tracked[0])[1] if tracked else None
     # Distinct colours: the hues of successive tracks are 0.618 turns apart.
     phase = np.arange(0 if tracks is None else len(tracks))[:, None] * 0.618 + np.array([0, 1 / 3, 2 / 3])
     colours = (127.5 + 127.5 * np.cos(2 * np.pi * phase)).astype(np.uint8)

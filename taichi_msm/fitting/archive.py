@@ -110,9 +110,8 @@ def _convert_trajectory(arrays: Arrays) -> Arrays:
     if position is None or position.ndim != 4 or min(position.shape[:3]) == 0 or "coordinates" in arrays:
         return arrays
     rows, cols = (np.unique(np.linspace(0, n - 1, min(n, 64)).round().astype(int)) for n in position.shape[1:3])
-    down, across = np.meshgrid(
-        rows / max(position.shape[1] - 1, 1), cols / max(position.shape[2] - 1, 1), indexing="ij"
-    )
+    heights, widths = rows / max(position.shape[1] - 1, 1), cols / max(position.shape[2] - 1, 1)
+    down, across = np.meshgrid(heights, widths, indexing="ij")
     thinned = position[:, rows[:, None], cols].reshape(len(position), len(rows) * len(cols), position.shape[3])
     coordinates = np.stack([across.ravel(), down.ravel()], axis=1)
     return {**arrays, "coordinates": coordinates, "position": thinned.swapaxes(0, 1)}

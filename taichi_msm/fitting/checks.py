@@ -7,9 +7,8 @@ from collections.abc import Iterator, Sequence
 import numpy as np
 
 from taichi_msm.fitting.observation import Array, Observation
-from taichi_msm.fitting.parameters import Parameter
 from taichi_msm.fitting.points import ROUNDING_SHARE
-from taichi_msm.fitting.predict import Prediction
+from taichi_msm.fitting.predict import FitProblem, Prediction
 from taichi_msm.model.rest import rest_of
 from taichi_msm.scene.scene import Scene
 from taichi_msm.scene.section import FRAME_TOLERANCE
@@ -31,14 +30,13 @@ def faults(observations: Sequence[Observation], scene: Scene, parameter_count: i
         yield f"{first.name}: no point moves {fault}; observe while a tool acts, at points near it"
 
 
-def faults_at_start(
-    observations: Sequence[Observation], scene: Scene, initial: Prediction, parameters: Sequence[Parameter] = ()
-) -> Iterator[str]:
+def faults_at_start(problem: FitProblem, scene: Scene, initial: Prediction) -> Iterator[str]:
     """Yield the faults found with a run of the initial scene: no motion at the times, another camera or origin, signs.
 
     The prediction reaches to the last frame. A free camera skips the check of the camera; a linear parameter, which may
     change sign, skips that of signs.
     """
+    observations, parameters = problem.observations, problem.parameters
     rate, motion, name = scene.time.frames_per_second, float(initial.motion.max()), observations[0].name
     if motion <= ROUNDING_SHARE * rest_of(scene.sheet).extent:
         yield f"{name}: none of its points moves in the scene; add probes that press near them"
@@ -47,18 +45,14 @@ def faults_at_start(
     observed_motion = float(np.interp(times * rate, np.arange(len(initial.motion)), initial.motion).max())
     if observed_motion < 0.1 * motion:
         moving = np.flatnonzero(initial.motion > 0.5 * motion) / rate
-        yield (
-            f"{name}: its {len(observations[0].time)} times miss the motion: "
-            f"the scene's points then move by {1000 * observed_motion:.3g} of {1000 * motion:.3g} mm; "
-            f"add times between {moving[0]:g} and {moving[-1]:g} s"
-        )
+        fault = f"the scene's points then move by {1000 * observed_motion:.3g} of {1000 * motion:.3g} mm"
+        remedy = f"add times between {moving[0]:g} and {moving[-1]:g} s"
+        yield f"{name}: its {len(observations[0].time)} times miss the motion: {fault}; {remedy}"
         return
     same_camera = not any(parameter.key.startswith("render.") for parameter in parameters)
-    messages = [
-        fault
-        for observed, predicted in zip(observations, initial.values, strict=True)
-        for fault in observed.faults_at_start(scene, predicted, same_camera=same_camera)
-    ]
+    messages: list[str] = []
+    for observed, predicted in zip(observations, initial.values, strict=True):
+        messages += observed.faults_at_start(scene, predicted, same_camera=same_camera)
     yield from messages
     if not messages and all(parameter.is_log for parameter in parameters):
         yield from opposed(observations, scene, initial)

@@ -25,10 +25,18 @@ from taichi_msm.fitting.machine_fit import FittedTest, contact_notes, explanatio
 from taichi_msm.fitting.machine_model import TABLE_OPTIONS, MachineProblem, read_machine_problem, table_paths
 from taichi_msm.fitting.observation import Array, ErrorCorrelation, Observation
 from taichi_msm.fitting.outliers import LeftOut, leave_out
-from taichi_msm.fitting.parameters import Bounds, Method, Parameter, as_data, make_parameters, require_types, rounded
-from taichi_msm.fitting.points import PointObservation
+from taichi_msm.fitting.parameters import (
+    Bounds,
+    Method,
+    Parameter,
+    Request,
+    as_data,
+    make_parameters,
+    require_types,
+    rounded,
+)
 from taichi_msm.fitting.predict import FitProblem, Prediction, Runs, without_outputs
-from taichi_msm.fitting.profiles import Profile, ProfilePoint, Profiler
+from taichi_msm.fitting.profiles import Profile, Profiler, quadratic_profile
 from taichi_msm.fitting.report import publication, write_report
 from taichi_msm.fitting.result import Estimate, FitResult, FittedMap
 from taichi_msm.fitting.stiffness_map import KEY, MapSettings, fit_map, map_settings
@@ -107,11 +115,11 @@ def fit(
             raise SceneError([f"{section}.tolerance: {tolerance:g} {fault}"])
     if repeated := [key for n, key in enumerate(free) if key in free[:n]]:
         raise SceneError([f"--free {repeated[0]}: given twice; leave one of them out"])
+    request, settings = Request(initial, free, bounds or {}, forces, method), None
     if tables := table_paths(observed):
-        problem: FitProblem = read_machine_problem(tables, initial, free, bounds or {}, forces, method)
-        settings = None
+        problem: FitProblem = read_machine_problem(tables, request)
     else:
-        problem, settings = _read_problem(observed, initial, free, bounds or {}, forces, method)
+        problem, settings = _read_problem(observed, request)
     with ExitStack() as stack:
         if directory is not None:
             # From here on an interruption is an exception, which removes the unfinished files.
@@ -120,9 +128,7 @@ def fit(
             publisher = stack.enter_context(publication(Path(directory)))
         if settings is not None:
             name = str(Path(directory or "", FittedMap.FILE))
-            (points,) = problem.observations
-            assert isinstance(points, PointObservation)
-            result = fit_map(initial, points, settings, name, progress)
+            result = fit_map(initial, problem, settings, name, progress)
         else:
             kind = CurveRuns if has_curve(problem) else Runs
             runs = stack.enter_context(kind(problem, workers, progress))
@@ -134,19 +140,13 @@ def fit(
     return result
 
 
-def _read_problem(
-    observed: Any,
-    initial: Scene,
-    free: Sequence[str],
-    bounds: Mapping[str, Bounds],
-    forces: tuple[str | Path, float] | None,
-    method: Method,
-) -> tuple[FitProblem, MapSettings | None]:
+def _read_problem(observed: Any, request: Request) -> tuple[FitProblem, MapSettings | None]:
     """Return the problem of a fit to points and forces, and the settings of its map, None for a fit of numbers."""
+    initial, free, bounds, forces, method = request
     points = read_observations(observed, initial.time.frames_per_second).with_sigma(method.get("sigma"))
     if unused := [name for name in TABLE_OPTIONS if method.get(name)]:
         raise SceneError([f"--{unused[0]}: only for tables of a testing machine; leave it out"])
-    settings = map_settings(initial, free, bounds, method.get("resolution"))
+    settings = map_settings(request)
     options = {"forces": forces, **{name: method.get(name) for name in ("robust", "profile", "correlation", "drift")}}
     if settings is not None and (conflicting := [name for name, value in options.items() if value]):
         raise SceneError([f"--free {KEY}: --{conflicting[0]} is only for fits of numbers; leave it out"])
@@ -174,7 +174,7 @@ def _fit(runs: Runs, scene: Scene, method: Method) -> FitResult:
     machine = runs.problem if isinstance(runs.problem, MachineProblem) else None
     messages: list[str] = []
     if machine is None:
-        messages += faults_at_start(observations, scene, initial, parameters)
+        messages += faults_at_start(runs.problem, scene, initial)
     if not any(probe.moved for probe in scene.probes):
         # Without position-controlled tools no tissue changes the forces, so a wrong unit is certain before the search.
         messages += unit_faults(observations, initial)
@@ -204,10 +204,12 @@ def _fit(runs: Runs, scene: Scene, method: Method) -> FitResult:
     is_profiled = uncertainties.is_correlated | method.get("profile", False)
     profiles = Profiler(runs, misfit, solution, uncertainties).profiles(np.flatnonzero(is_profiled).tolist())
     mesh_error, shifts = _mesh_effect(runs, misfit, solution, uncertainties)
-    estimates = {
-        parameter.key: _estimate(parameter, float(solution.x[n]), n, uncertainties, profiles.get(n), shifts)
-        for n, parameter in enumerate(parameters)
-    }
+    estimates, curves = {}, {}
+    pairs = zip(solution.x.tolist(), uncertainties.deviations.tolist(), strict=True)
+    for n, (parameter, (x, deviation)) in enumerate(zip(parameters, pairs, strict=True)):
+        profile = profiles.get(n) or quadratic_profile(x, deviation, uncertainties.quantile)
+        estimates[parameter.key] = _estimate(parameter, x, deviation, profile, float(shifts[n]))
+        curves[parameter.key] = [point._replace(x=parameter.value(point.x)) for point in profile.points]
     values = {key: estimate.value for key, estimate in estimates.items()}
     measures_forces = any(observed.noun == "forces" for observed in observations)
     unidentified = unidentified_groups(parameters, solution.x, uncertainties, forces=measures_forces)
@@ -253,10 +255,7 @@ def _fit(runs: Runs, scene: Scene, method: Method) -> FitResult:
         left_out=left_out,
         fitted=solution.predicted.values,
         tests=tests,
-        curves={
-            parameter.key: _curve(parameter, n, solution.x, uncertainties, profiles.get(n))
-            for n, parameter in enumerate(parameters)
-        },
+        curves=curves,
     )
 
 
@@ -281,15 +280,15 @@ def uncertainty_notes(
     parameters: Sequence[Parameter],
     x: Array,
     uncertainties: Uncertainty,
-    shifts: Array | None,
+    shifts: Array,
     unidentified: Sequence[UnidentifiedGroup],
 ) -> Iterator[str]:
     """Yield warnings about mesh errors beyond the intervals, and about correlated, but identified parameters.
 
-    The mesh errors `shifts`, in units of x, have shape (n,), NaN if unknown; None if all are.
+    The mesh errors `shifts`, in units of x, have shape (n,), NaN if unknown.
     """
     half_widths = uncertainties.quantile * uncertainties.deviations
-    if shifts is not None and (moved := np.flatnonzero(shifts > half_widths).tolist()):
+    if moved := np.flatnonzero(shifts > half_widths).tolist():
         changes = [(parameters[n].key, parameters[n].format_error(x[n], float(shifts[n]))) for n in moved]
         shown = ", ".join(f"{key} by about {change}" for key, change in changes)
         yield f"the mesh changes {shown}, more than the interval; take more sheet.points"
@@ -330,15 +329,15 @@ def _larger_part(observations: Sequence[Observation], parts: Sequence[Array], pr
 
 def _mesh_effect(
     runs: Runs, misfit: Misfit, solution: Solution, uncertainties: Uncertainty
-) -> tuple[float | None, Array | None]:
-    """Return the mesh error, and the shift of x that it causes, shape (n,), NaN if unknown; None without coarse meshes.
+) -> tuple[float | None, Array]:
+    """Return the mesh error, None without coarse meshes, and the shift of x that it causes, shape (n,), NaN if unknown.
 
     Richardson extrapolation, with the order of convergence of three meshes, at most the expected order. The two finer
     meshes may agree by chance: a shift is at least the coarser one, reduced by the expected order.
     """
     error = runs.mesh_error(solution.x)
     if error is None or (half_mesh := runs.predict_coarse(solution.x, 1)) is None:
-        return None, None
+        return None, np.full(len(solution.x), np.nan)
     expected_order = CONTACT_ORDER if any(probe.moved for probe in runs.problem.scene.probes) else 2.0
 
     def shift_between(coarse: Prediction, fine: Prediction) -> Array:
@@ -353,41 +352,13 @@ def _mesh_effect(
     return error, np.where(uncertainties.unidentified, np.nan, shifts / (2**order - 1))
 
 
-def _estimate(
-    parameter: Parameter,
-    x: float,
-    index: int,
-    uncertainties: Uncertainty,
-    profile: Profile | None,
-    shifts: Array | None,
-) -> Estimate:
-    deviation = float(uncertainties.deviations[index])
-    half_width = uncertainties.quantile * deviation
-    ends: tuple[float | None, float | None] = (x - half_width, x + half_width)
-    if profile is not None:
-        ends = profile.low, profile.high
+def _estimate(parameter: Parameter, x: float, deviation: float, profile: Profile, mesh_shift: float) -> Estimate:
+    """Return an estimate; `mesh_shift`: shift of x by the mesh, NaN if unknown."""
     low, high = parameter.limits
-    interval = [None if end is None or not low <= end <= high else parameter.value(end) for end in ends]
+    interval = [None if end is None or not low <= end <= high else parameter.value(end) for end in profile[1:]]
     if parameter.start < 0 and parameter.is_log:
         interval.reverse()
-    return Estimate(
-        value=parameter.value(x),
-        standard_error=parameter.error(x, deviation),
-        interval=(interval[0], interval[1]),
-        start=parameter.start,
-        identifiable=parameter.relative_error(x, deviation) <= MAX_RELATIVE_ERROR,
-        mesh_error=None if shifts is None or math.isnan(shifts[index]) else parameter.error(x, float(shifts[index])),
-    )
-
-
-def _curve(
-    parameter: Parameter, index: int, x: Array, uncertainties: Uncertainty, profile: Profile | None
-) -> list[ProfilePoint]:
-    """Return the profile of a parameter, or its quadratic approximation."""
-    if profile is not None:
-        return [ProfilePoint(parameter.value(point.x), point.deviations) for point in profile.points]
-    # The limit bounds the plotted range of unidentified parameters.
-    deviation = min(float(uncertainties.deviations[index]), 3.0)
-    return [
-        ProfilePoint(parameter.value(x[index] + offset * deviation), float(offset)) for offset in np.linspace(-3, 3, 25)
-    ]
+    value, error = parameter.value(x), parameter.error(x, deviation)
+    identifiable = parameter.relative_error(x, deviation) <= MAX_RELATIVE_ERROR
+    mesh_error = None if math.isnan(mesh_shift) else parameter.error(x, mesh_shift)
+    return Estimate(value, error, (interval[0], interval[1]), parameter.start, identifiable, mesh_error)

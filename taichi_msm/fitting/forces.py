@@ -140,8 +140,7 @@ def read_forces(path: str | Path, sigma: float, probe_count: int) -> ToolForces:
     _require_units(grid.place(header), [units[column] for column in columns])
     rows = [n for n in range(header + 1, len(grid.rows)) if grid.has_content(n)]
     # The first row below the header may consist of units.
-    first_row = grid.rows[rows[0]] if rows else []
-    row_units = [first_row[column].strip("[]() ") if column < len(first_row) else "" for column in columns]
+    row_units = [grid.cell(rows[0] if rows else None, column).strip("[]() ") for column in columns]
     if row_units[0].isalpha() and row_units[0].lower() != "nan":
         _require_units(grid.place(rows.pop(0)), row_units)
     for n in rows:

@@ -8,7 +8,7 @@ alternately with the parameters.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -19,6 +19,9 @@ from taichi_msm.fitting.predict import Prediction, Runs
 
 # Largest residual with almost full weight in robust fits, in sigma.
 OUTLIER_SIGMAS = 2.0
+
+# Relative changes of the cost and of x, and the gradient, at which a search ends.
+TOLERANCES = {"ftol": 1e-6, "xtol": 1e-8, "gtol": 1e-12}
 
 # Largest coordinate of an alternative start, a factor of 10 from the initial value.
 MAX_START_LOG = np.log(10.0)
@@ -90,6 +93,15 @@ class Misfit:
         rho = 2 * OUTLIER_SIGMAS**2 * (np.sqrt(self.robust_factor(residuals)) - 1) if self.robust else residuals**2
         return float(np.sum(rho)) / 2
 
+    def total(self, predicted: Prediction, scales: Scales) -> float:
+        """Return the cost of a prediction."""
+        return self.cost(self.residuals(predicted, scales))
+
+    def two_best(self, predictions: Iterable[tuple[Array, Prediction | None]], scales: Scales) -> list[Array]:
+        """Return the two coordinates of lowest cost; None is the prediction of a failed run."""
+        costs = [(self.total(predicted, scales), x.tolist()) for x, predicted in predictions if predicted is not None]
+        return [np.array(x) for _, x in sorted(costs)[:2]]
+
     def deviations(self, predicted: Prediction, parameter_count: int) -> list[float]:
         """Return the standard deviation of every observation, in its unit, estimated from its residuals."""
         deviations = []
@@ -129,12 +141,11 @@ class Search:
             return solution
         starts = self.alternative_starts()
         self._runs.expected += len(starts)
-        predictions = enumerate(self._runs.predict_many(starts))
-        costs = [(self._cost(predicted, solution.scales), n) for n, predicted in predictions if predicted is not None]
-        for _, n in sorted(costs)[:2]:
-            candidate = self.refine(starts[n])
+        predictions = zip(starts, self._runs.predict_many(starts), strict=True)
+        for x in self.misfit.two_best(predictions, solution.scales):
+            candidate, scales = self.refine(x), solution.scales
             # Costs are comparable only with the same sigma.
-            if self._cost(candidate.predicted, solution.scales) < self._cost(solution.predicted, solution.scales):
+            if self.misfit.total(candidate.predicted, scales) < self.misfit.total(solution.predicted, scales):
                 solution = candidate
             if self.fits_well(solution):
                 break
@@ -194,19 +205,9 @@ class Search:
             assert predicted is not None
             return self.misfit.scaled(self._differences(x, predicted, signs=(1,)), scales)
 
+        loss = {"loss": "soft_l1" if self.misfit.robust else "linear", "f_scale": OUTLIER_SIGMAS}
         with np.errstate(all="ignore"):  # SciPy divides by gradients that are 0.
-            result = least_squares(
-                residuals,
-                start,
-                jacobian,
-                self._limits,
-                ftol=1e-6,
-                xtol=1e-8,
-                gtol=1e-12,
-                loss="soft_l1" if self.misfit.robust else "linear",
-                f_scale=OUTLIER_SIGMAS,
-                max_nfev=40,
-            )
+            result = least_squares(residuals, start, jacobian, self._limits, max_nfev=40, **TOLERANCES, **loss)
         predicted = self._predict(result.x)
         assert predicted is not None
         return Solution(result.x, predicted, scales, float(result.cost), bool(result.status > 0))
@@ -239,9 +240,6 @@ class Search:
             (x_first, first), (x_second, second) = [*sides, (x[n], predicted)][:2]
             columns.append((self.misfit.vector(first) - self.misfit.vector(second)) / (x_first - x_second))
         return np.stack(columns, axis=1)
-
-    def _cost(self, predicted: Prediction, scales: Scales) -> float:
-        return self.misfit.cost(self.misfit.residuals(predicted, scales))
 
     def alternative_starts(self) -> list[Array]:
         """Return a Sobol sequence of starts within the bounds, at least 8 per parameter, or 8 for machine tests."""

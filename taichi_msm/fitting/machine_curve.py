@@ -17,7 +17,7 @@ with G, share_i, phi_i and memory s_i as in `terms/viscoelasticity.py`.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import replace
 from typing import NamedTuple
@@ -25,7 +25,7 @@ from typing import NamedTuple
 import numpy as np
 
 from taichi_msm.errors import DivergedError, SceneError, StageProgressCallback
-from taichi_msm.fitting.least_squares import Misfit, Scales, Search, Solution
+from taichi_msm.fitting.least_squares import Misfit, Search, Solution
 from taichi_msm.fitting.machine_model import MachineModel, MachineProblem
 from taichi_msm.fitting.observation import Array
 from taichi_msm.fitting.parameters import with_values
@@ -115,10 +115,9 @@ class CurveRuns(Runs):
         return self._predict(values, tangent.reach, tangent.forces * np.exp(distance @ tangent.slopes))
 
     def predict_coarse(self, x: Array, halvings: int) -> Prediction | None:
-        try:
+        with suppress(SceneError, DivergedError):
             return self.run_curve(x, halvings)
-        except (SceneError, DivergedError):
-            return None
+        return None
 
     def mesh_error(self, x: Array) -> float | None:
         # The run of the curve has the mesh error of the tests.
@@ -127,9 +126,7 @@ class CurveRuns(Runs):
 
     def run_curve(self, x: Array, halvings: int = 0) -> Prediction:
         """Return the prediction by a curve at x, shape (n,); raise the errors of `ForwardModel.predict`."""
-        values = self._model.values(x)
-        reach = self._reach(values)
-        return self._predict(values, reach, self._forces(values, reach, halvings))
+        return self._predict(*self._curve(x, halvings))
 
     def run_tests(self, x: Array) -> Prediction:
         """Return the prediction by runs of the tests at x; raise the errors of `ForwardModel.predict`."""
@@ -160,9 +157,7 @@ class CurveRuns(Runs):
 
     def set_tangent(self, x: Array) -> None:
         """Linearise the curve at x; raise the errors of `ForwardModel.predict`."""
-        values = self._model.values(x)
-        reach = self._reach(values)
-        forces, slopes = self._forces(values, reach), np.zeros((len(x), TRAVELS + 1))
+        (_, reach, forces), slopes = self._curve(x), np.zeros((len(x), TRAVELS + 1))
         for n in np.flatnonzero(self.changes_curve):
             shifted, delta = x.copy(), self.problem.difference_step
             delta = delta if x[n] + delta <= self.problem.parameters[n].limits[1] else -delta
@@ -180,9 +175,8 @@ class CurveRuns(Runs):
         low, high = self.problem.limits
         # A parameter without effect does not move, which shrinks its region to 0.
         region = np.maximum(region, 1e-6)
-        margin = np.array(
-            [CONTACT_MARGIN * self._tangent.reach / (parameter.scale or 1) for parameter in self.problem.parameters]
-        )
+        scales = np.array([parameter.scale or 1 for parameter in self.problem.parameters])
+        margin = CONTACT_MARGIN * self._tangent.reach / scales
         below = np.where(self._is_contact, np.minimum(region, margin), region)
         return np.maximum(low, x - below), np.minimum(high, x + region)
 
@@ -191,15 +185,19 @@ class CurveRuns(Runs):
 
         Depths of contact that are given, or parameters, have no column.
         """
-        values = self._model.values(x)
-        reach = self._reach(values)
-        forces, step = self._forces(values, reach), 1e-3 * reach
-        columns = []
+        values, reach, forces = self._curve(x)
+        step, columns = 1e-3 * reach, []
         for loading, key in zip(self.problem.tests, self.problem.contact_keys, strict=True):
             if loading.finds_contact and key not in values:
                 moved = [self._predict(values | {key: loading.contact + end}, reach, forces) for end in (step, -step)]
                 columns.append((moved[0].values[0] - moved[1].values[0]) / (2 * step))
         return np.hstack([np.empty((sum(len(loading.force) for loading in self.problem.tests), 0)), *columns])
+
+    def _curve(self, x: Array, halvings: int = 0) -> tuple[dict[str, float], float, Array]:
+        """Return the parameter values by key at x, the greatest travel [m], and the forces of a curve."""
+        values = self._model.values(x)
+        reach = self._reach(values)
+        return values, reach, self._forces(values, reach, halvings)
 
     def _reach(self, values: dict[str, float]) -> float:
         """Return the greatest travel of a curve [m]; raise a SceneError if it is 0 in all tests."""
@@ -224,11 +222,9 @@ class CurveRuns(Runs):
         # Too large shares are scaled down: an error instead would be a wall that the search cannot leave.
         scale = min(1.0, MAX_SHARES / max(sum(share for share, _ in branches), NO_SHARE))
         branches = [(scale * share, time) for share, time in branches]
-        forces_of_tests = [
-            relax(curve(loading.travel(values.get(key))), branches, 1 / loading.rate)
-            for loading, key in zip(self.problem.tests, self.problem.contact_keys, strict=True)
-        ]
-        return Prediction((np.concatenate(forces_of_tests)[:, None] + self._correction,), 1, np.zeros(1))
+        pairs = zip(self.problem.tests, self.problem.contact_keys, strict=True)
+        of_tests = [relax(curve(test.travel(values.get(key))), branches, 1 / test.rate) for test, key in pairs]
+        return Prediction((np.concatenate(of_tests)[:, None] + self._correction,), 1, np.zeros(1))
 
     def _forces(self, values: dict[str, float], reach: float, halvings: int = 0) -> Array:
         """Return the forces of a curve at equidistant travels [N], shape (TRAVELS + 1,), with a cache."""
@@ -262,7 +258,7 @@ def search_by_curve(runs: CurveRuns, misfit: Misfit, start: Array, initial: Pred
     starts = []
     if not search.fits_well(solution):
         predictions = ((x, runs.predict_coarse(x, 0)) for x in search.alternative_starts())
-        starts = _two_best(predictions, misfit, solution.scales)
+        starts = misfit.two_best(predictions, solution.scales)
     # A parameter with an effect below 3 sigma per unit of x, such as a lock beyond the measured range, may fit better
     # at a smaller value.
     effect = np.linalg.norm(misfit.scaled(search.jacobian(solution), solution.scales), axis=0)
@@ -294,7 +290,7 @@ def _descend(runs: CurveRuns, misfit: Misfit, start: Array, *, by_tests: bool) -
 
     def evaluate(x: Array) -> Solution:
         predicted = runs.run_tests(x) if by_tests else runs.run_curve(x)
-        return Solution(x, predicted, scales, misfit.cost(misfit.residuals(predicted, scales)), converged=False)
+        return Solution(x, predicted, scales, misfit.total(predicted, scales), converged=False)
 
     def is_converged(cost: float, previous: float) -> bool:
         # A third of a standard deviation of a parameter changes the cost by 0.05.
@@ -340,14 +336,4 @@ def _relaxation_starts(runs: CurveRuns, misfit: Misfit, current: Solution, limit
     low, high = (np.clip(limit[free], current.x[free] - max_log, current.x[free] + max_log) for limit in limits)
     starts = np.tile(current.x, (64, 1))
     starts[:, free] = low + qmc.Sobol(len(free), seed=1).random(64) * (high - low)
-    return _two_best(((x, runs.predict_one(x)) for x in starts), misfit, current.scales)
-
-
-def _two_best(predictions: Iterable[tuple[Array, Prediction | None]], misfit: Misfit, scales: Scales) -> list[Array]:
-    """Return the two coordinates of lowest cost; None is the prediction of a failed run."""
-    costs = [
-        (misfit.cost(misfit.residuals(predicted, scales)), x.tolist())
-        for x, predicted in predictions
-        if predicted is not None
-    ]
-    return [np.array(x) for _, x in sorted(costs)[:2]]
+    return misfit.two_best(((x, runs.predict_one(x)) for x in starts), current.scales)

@@ -75,9 +75,8 @@ def fitted_tests(
         residual = loading.sigma[frame] * uncertainties.residuals[frames][frame]
         offset = float(residual - (force - loading.force)[frame])
         mean_slopes = weights @ slopes[frames] / weights.sum()
-        error = math.hypot(
-            math.sqrt(uncertainties.factor / weights.sum()), float(np.linalg.norm(mean_slopes @ uncertainties.root))
-        )
+        by_parameters = float(np.linalg.norm(mean_slopes @ uncertainties.root))
+        error = math.hypot(math.sqrt(uncertainties.factor / weights.sum()), by_parameters)
         tests.append(FittedTest(loading.without_offset(offset), values.get(key, loading.contact), force, error))
     return tuple(tests)
 
@@ -141,26 +140,23 @@ def _explain(fitted: FittedTest, *, fits_contact: bool) -> str:
     at_ends = np.interp(test.time[[peak, last]], loading.time, predicted)
     model_fall = 1 - float(at_ends[1] / at_ends[0]) if last > peak and at_ends[0] > 0 else 0.0
     if fall > 0.05 and model_fall < 0.5 * fall:
-        return (
-            f"the force falls by {100 * fall:.0f} % while the tool is held, the fitted force by "
-            f"{100 * max(model_fall, 0.0):.0f} %: free the shares and times of tissue.relaxation"
-        )
+        falls = f"{100 * fall:.0f} % while the tool is held, the fitted force by {100 * max(model_fall, 0.0):.0f} %"
+        return f"the force falls by {falls}: free the shares and times of tissue.relaxation"
     at_peak = float(travel[loading.force.argmax()])
     rising = slice(0, int(np.argmax(travel >= (1 - HELD_SHARE) * at_peak)) + 1)
     if not fits_contact and at_peak and (reason := _explain_by_another_contact(fitted, rising)):
         return reason
     depth, measured, model = travel[rising], loading.force[rising], predicted[rising]
-    half_forces = [
-        float(np.interp(0.5 * depth[-1], np.maximum.accumulate(depth), force)) for force in (measured, model)
-    ]
-    shares = [100 * half / float(force[-1]) for half, force in zip(half_forces, (measured, model), strict=True)]
+    shares = []
+    for force in (measured, model):
+        at_half = float(np.interp(0.5 * depth[-1], np.maximum.accumulate(depth), force))
+        shares.append(100 * at_half / float(force[-1]))
     if abs(shares[0] - shares[1]) <= 4:
         return ""
     comparison = "more" if shares[0] < shares[1] else "less"
-    return (
-        f"at half the depth the force is {rounded(shares[0])} % of the peak, the fitted force {rounded(shares[1])} %: "
-        f"the tissue stiffens {comparison} with the depth: free or change a lock"
-    )
+    halves = f"{rounded(shares[0])} % of the peak, the fitted force {rounded(shares[1])} %"
+    remedy = f"the tissue stiffens {comparison} with the depth: free or change a lock"
+    return f"at half the depth the force is {halves}: {remedy}"
 
 
 def _explain_by_another_contact(fitted: FittedTest, rising: slice) -> str:
@@ -193,10 +189,9 @@ def _explain_by_another_contact(fitted: FittedTest, rising: slice) -> str:
     if shift > 0 and coefficients[1] > CONTACT_NOISES * loading.noise:
         slack = f" after a slack with {coefficients[1]:.2g} N"
     contact = f"{fitted.contact + shift:.4g}"
-    return (
-        f"a contact at {1000 * float(contact):g} mm of the table, not {1000 * fitted.contact:.4g} mm,{slack} explains "
-        f"{rounded(100 * explained)} % of the residual: give --contact {contact}, or --free contact"
-    )
+    depths = f"{1000 * float(contact):g} mm of the table, not {1000 * fitted.contact:.4g} mm,{slack}"
+    effect = f"explains {rounded(100 * explained)} % of the residual"
+    return f"a contact at {depths} {effect}: give --contact {contact}, or --free contact"
 
 
 def _fit_linear(values: Array, *columns: Array) -> tuple[float, Array]:

@@ -13,7 +13,7 @@ from taichi_msm.errors import Pause, SceneError
 from taichi_msm.fitting.forces import Forces
 from taichi_msm.fitting.observation import Array, ObservationModel
 from taichi_msm.fitting.panels import Panel
-from taichi_msm.fitting.parameters import Bounds, Method, Parameter, as_data, make_parameters, with_values
+from taichi_msm.fitting.parameters import Parameter, Request, as_data, make_parameters, with_values
 from taichi_msm.fitting.predict import FitProblem, ForwardModel, Prediction, without_outputs
 from taichi_msm.load.check import check_scene
 from taichi_msm.machines.loading import (
@@ -159,15 +159,9 @@ def table_paths(observed: Any) -> list[str]:
     return [str(path) for path in paths]
 
 
-def read_machine_problem(
-    paths: Sequence[str],
-    scene: Scene,
-    free: Sequence[str],
-    bounds: Mapping[str, Bounds],
-    forces: object,
-    method: Method,
-) -> MachineProblem:
-    """Return the fit problem of machine tables; `forces`, the value of --forces, must be None."""
+def read_machine_problem(paths: Sequence[str], request: Request) -> MachineProblem:
+    """Return the fit problem of machine tables, which exclude --forces."""
+    scene, free, _, forces, method = request
     if forces is not None:
         raise SceneError([f"--forces: {paths[0]} contains forces already; leave the option out"])
     if unused := [name for name in POINT_OPTIONS if method.get(name) is not None]:
@@ -189,7 +183,7 @@ def read_machine_problem(
         if is_estimated and (note := late_contact_note(loading, key)):
             loading = replace(loading, test=replace(loading.test, notes=(*loading.test.notes, note)))
         tests.append(loading)
-    parameters = _make_parameters(scene, tests, free, bounds, approach.probe)
+    parameters = _make_parameters(request, tests, approach.probe)
     first = tests[0]
     placed = approach.place(as_data(without_outputs(scene)), first.travel(), first.rate)
     observations = MachineForces(
@@ -207,11 +201,9 @@ def read_machine_problem(
     return MachineProblem(Scene(**placed), parameters, (observations,), tuple(tests), approach=approach)
 
 
-def _make_parameters(
-    scene: Scene, tests: Sequence[Loading], free: Sequence[str], bounds: Mapping[str, Bounds], probe: int
-) -> tuple[Parameter, ...]:
-    """Build the parameters of the keys `free`, including depths of contact; `probe`: index of the tool."""
-    contacts = contact_keys(len(tests))
+def _make_parameters(request: Request, tests: Sequence[Loading], probe: int) -> tuple[Parameter, ...]:
+    """Build the parameters of the free keys, including depths of contact; `probe`: index of the tool."""
+    (scene, free, bounds, _, _), contacts = request, contact_keys(len(tests))
     for key in free:
         if key.partition(".")[0] == "contact" and key not in contacts:
             raise SceneError([f"--free {key}: no such table; take {' or '.join(contacts)}"])

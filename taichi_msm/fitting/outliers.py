@@ -66,10 +66,8 @@ def leave_out(search: Search, solution: Solution) -> tuple[Solution, list[LeftOu
         search.misfit = Misfit(rest, everything.signals, robust=False)
         solution = search.refine(solution.x)
     assert left_out is not None
-    return solution, [
-        LeftOut(observed.noun, mask, int(observed.known.any(axis=-1).sum()))
-        for observed, mask in zip(everything.observations, left_out, strict=True)
-    ]
+    masks = zip(everything.observations, left_out, strict=True)
+    return solution, [LeftOut(each.noun, mask, int(each.known.any(axis=-1).sum())) for each, mask in masks]
 
 
 def _find(observed: Observation, predicted: Array, signal: float) -> NDArray[np.bool_]:

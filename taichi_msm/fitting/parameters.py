@@ -12,7 +12,7 @@ from copy import deepcopy
 from dataclasses import dataclass
 from numbers import Integral, Real
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 from typing_extensions import TypedDict
 
@@ -71,10 +71,8 @@ class Parameter:
         if not self.is_log:
             return (self.low - self.start) / self.scale, (self.high - self.start) / self.scale
         shares = sorted((self.low / self.start, self.high / self.start))
-        return (
-            math.log(shares[0]) if shares[0] > 0 else -MAX_LOG,
-            math.log(shares[1]) if shares[1] < math.inf else MAX_LOG,
-        )
+        low = math.log(shares[0]) if shares[0] > 0 else -MAX_LOG
+        return low, math.log(shares[1]) if shares[1] < math.inf else MAX_LOG
 
     def error(self, x: float, deviation: float) -> float:
         """Return the standard deviation of the value from that of x."""
@@ -226,6 +224,16 @@ class Method(TypedDict, total=False):
     window: tuple[float, float] | None
     rate: float | None
     contact: Sequence[float] | None
+
+
+class Request(NamedTuple):
+    """Arguments of `fit` but the observed data, as documented there."""
+
+    scene: Scene
+    free: Sequence[str]
+    bounds: Mapping[str, Bounds]
+    forces: tuple[str | Path, float] | None
+    method: Method
 
 
 def require_types(observed: Any, free: Any, method: Mapping[str, Any], **others: Any) -> None:

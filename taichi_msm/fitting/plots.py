@@ -69,32 +69,26 @@ def _test_panels(tests: Sequence[FittedTest]) -> list[Panel]:
     titles = [printable(Path(test.loading.test.name).name) for test in tests] if len(tests) > 1 else ["Force over time"]
     panels: list[Panel] = []
     for test, title in zip(tests, titles, strict=False):
-        panels.append(partial(_plot_test_over_time, fitted=test, title=title))
-        panels.append(partial(_plot_test_over_depth, fitted=test))
+        panels.append(partial(_plot_test, fitted=test, title=title))
+        panels.append(partial(_plot_test, fitted=test, title="Force over depth", over_depth=True))
         panels.append(partial(_plot_test_residual, fitted=test))
     return panels
 
 
-def _plot_test_over_time(axes: Axes, fitted: FittedTest, title: str) -> None:
-    """Plot the force of a machine test over time: all rows of the table, frames, and the fitted force."""
+def _plot_test(axes: Axes, fitted: FittedTest, title: str, *, over_depth: bool = False) -> None:
+    """Plot the forces of a machine test over time, or over depth: all rows of the table, frames, and the fit."""
     loading = fitted.loading
-    axes.plot(loading.test.time, loading.test.force, ".", color=SILVER, markersize=2, label="table")
-    axes.plot(loading.time, loading.force, ".", color=VERMILION, markersize=3, label="measured, of a frame")
-    axes.plot(loading.time, fitted.force, color=BLUE, label="fitted")
+    row_x, x, label = loading.test.time, loading.time, "time [s]"
+    if over_depth:
+        row_x, x, label = 1000 * loading.test.depth, 1000 * loading.depth, "depth of the table [mm]"
+    axes.plot(row_x, loading.test.force, ".", color=SILVER, markersize=2, label="table")
+    axes.plot(x, loading.force, ".", color=VERMILION, markersize=3, label="measured, of a frame")
+    axes.plot(x, fitted.force, color=BLUE, label="fitted")
+    if over_depth:
+        axes.axvline(1000 * fitted.contact, color=GREY, linewidth=0.8, linestyle=DASHED, label="contact")
     axes.set_title(title, parse_math=False)
-    axes.set(xlabel="time [s]", ylabel="force [N]")
-    axes.legend()
-
-
-def _plot_test_over_depth(axes: Axes, fitted: FittedTest) -> None:
-    """Plot the force of a machine test over depth, with the depth of contact."""
-    loading = fitted.loading
-    axes.plot(1000 * loading.test.depth, loading.test.force, ".", color=SILVER, markersize=2)
-    axes.plot(1000 * loading.depth, loading.force, ".", color=VERMILION, markersize=3)
-    axes.plot(1000 * loading.depth, fitted.force, color=BLUE)
-    axes.axvline(1000 * fitted.contact, color=GREY, linewidth=0.8, linestyle=DASHED, label="contact")
-    axes.set(title="Force over depth", xlabel="depth of the table [mm]", ylabel="force [N]")
-    axes.legend()
+    axes.set(xlabel=label, ylabel="force [N]")
+    axes.legend(handles=axes.lines[3:] if over_depth else axes.lines)
 
 
 def _plot_test_residual(axes: Axes, fitted: FittedTest) -> None:
@@ -131,25 +125,16 @@ def _map_panels(fitted_map: FittedMap, sheet: Sheet) -> list[Panel]:
     plot_cells = partial(_plot_cells, unknown=fitted_map.unknown, sheet=sheet)
     return [
         partial(plot_cells, values=fitted_map.factors, norm=norm, title="Stiffness", label="factor of young"),
-        partial(
-            plot_cells, values=errors, norm=error_norm, title="Standard error", label="error [%]", colours="cividis"
-        ),
+        partial(plot_cells, values=errors, norm=error_norm, title="Standard error", label="error [%]"),
         partial(_plot_weight, choice=fitted_map.choice),
     ]
 
 
 def _plot_cells(
-    axes: Axes,
-    values: Array,
-    unknown: NDArray[np.bool_],
-    sheet: Sheet,
-    norm: Normalize,
-    title: str,
-    label: str,
-    colours: str = "viridis",
+    axes: Axes, values: Array, unknown: NDArray[np.bool_], sheet: Sheet, norm: Normalize, title: str, label: str
 ) -> None:
     """Plot values of the map cells on the sheet, with unknown cells hatched."""
-    known = np.where(unknown, np.nan, values)
+    known, colours = np.where(unknown, np.nan, values), "viridis" if isinstance(norm, LogNorm) else "cividis"
     image = axes.imshow(known, colours, norm=norm, extent=(0, 1, 1, 0), interpolation="nearest")
     side = 1 / len(values)
     for row, col in np.argwhere(unknown) * side:

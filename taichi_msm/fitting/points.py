@@ -59,7 +59,7 @@ class PointModel(ObservationModel):
 
     def predict(self, recorded: Array) -> Array:
         """Return the values, shape (N, T, 3 or 2); `recorded`: points at all frames [m], shape (frames, N, 3)."""
-        return self.observe(self.interpolate(recorded))
+        return self._observed.observe(self.scene, self.interpolate(recorded))
 
     def motion(self, recorded: Array) -> Array:
         """Return the largest displacement at every frame [m], shape (frames,); `recorded`: as for `predict`."""
@@ -78,10 +78,6 @@ class PointModel(ObservationModel):
     def points(self, position: Array) -> Array:
         """Return the observed points [m], shape (N, T, 3); `position`: shape (frames, rows, cols, 3)."""
         return self.interpolate(self.on_sheet(position))
-
-    def observe(self, points: Array) -> Array:
-        """Convert points [m], shape (N, T, 3), to values, shape (N, T, 3 or 2), NaN behind the camera."""
-        return self._observed.observe(self.scene, points)
 
     def backward(self, points: Array, gradient: Array) -> Array:
         """Return the gradient of a loss by the positions of all frames, shape (frames, rows, cols, 3).
@@ -314,11 +310,10 @@ class Positions(PointObservation):
                 float(np.linalg.norm(points - points.mean(axis=0), axis=1).max()) for points in (centres, rest[:, :2])
             )
             if rest_extent > 0 and extent > 0 and not 1 / MAX_EXTENT_RATIO < extent / rest_extent < MAX_EXTENT_RATIO:
-                fault = (
-                    f"the points extend {extent:.3g} m from their middle, but {rest_extent:.3g} m at rest; give metres"
-                )
-                unit = {3: ": are they in mm? divide them by 1000", 2: ": are they in cm? divide them by 100"}
-                yield f"{self.subject}: {fault}{unit.get(round(math.log10(extent / rest_extent)), '')}"
+                extents = f"{extent:.3g} m from their middle, but {rest_extent:.3g} m at rest"
+                units = {3: ": are they in mm? divide them by 1000", 2: ": are they in cm? divide them by 100"}
+                unit = units.get(round(math.log10(extent / rest_extent)), "")
+                yield f"{self.subject}: the points extend {extents}; give metres{unit}"
         yield from super().faults(scene)
 
 
@@ -338,12 +333,11 @@ class Pixels(PointObservation):
         return np.stack(pixels, axis=1)
 
     def backward(self, scene: Scene, points: Array, gradient: Array) -> Array:
-        steps = 1e-6 * rest_of(scene.sheet).extent * np.eye(3)
-        changes = (
-            (self.observe(scene, points + step) - self.observe(scene, points - step)) / (2 * step.sum())
-            for step in steps
-        )
-        return np.stack([(gradient * change).sum(axis=-1) for change in changes], axis=-1)
+        by_axis = []
+        for step in 1e-6 * rest_of(scene.sheet).extent * np.eye(3):
+            change = (self.observe(scene, points + step) - self.observe(scene, points - step)) / (2 * step.sum())
+            by_axis.append((gradient * change).sum(axis=-1))
+        return np.stack(by_axis, axis=-1)
 
     def conventions(self, scene: Scene) -> Conventions:
         """Return the conventions of pixels."""

@@ -6,11 +6,10 @@ Runs are in f64, and every process compiles its kernels once.
 from __future__ import annotations
 
 import math
-import secrets
 import time
 from collections.abc import Mapping, Sequence
 from concurrent.futures import Future, wait
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
@@ -52,7 +51,6 @@ class FitProblem:
     parameters: tuple[Parameter, ...]
     observations: tuple[Observation, ...]
     tests: tuple[Loading, ...] = ()  # of testing machines
-    token: str = field(default_factory=lambda: secrets.token_hex(8))  # identifier of the fit in worker processes
 
     @property
     def limits(self) -> tuple[Array, Array]:
@@ -165,17 +163,15 @@ class ForwardModel:
             self._simulation.close()
 
 
-# Forward model of the last fit in this process by token; at most one entry.
-_cached_models: dict[str, ForwardModel] = {}
+# Forward model of a worker process, which serves a single fit, after the first prediction.
+_models: list[ForwardModel] = []
 
 
 def predict_in_worker(problem: FitProblem, x: Array, steps: int | None) -> Prediction | None:
-    """Return the result of `ForwardModel.try_predict` on one thread; the forward model is kept for the next call."""
-    if problem.token not in _cached_models:
-        for token in list(_cached_models):
-            _cached_models.pop(token).close()
-        _cached_models[problem.token] = problem.build_model(threads=1)
-    return _cached_models[problem.token].try_predict(x, steps)
+    """Return the result of `ForwardModel.try_predict` on one thread, in a worker process."""
+    if not _models:
+        _models.append(problem.build_model(threads=1))
+    return _models[0].try_predict(x, steps)
 
 
 def mesh_error(plan: Plan, pause: Pause) -> float | None:

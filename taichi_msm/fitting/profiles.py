@@ -25,6 +25,7 @@ PROFILE_TOLERANCE = 0.01
 COST_TOLERANCE, MAX_STEPS = 0.01, 8
 
 Side = Generator[Array, "Prediction | None", "list[ProfilePoint]"]
+Minimum = Generator[Array, "Prediction | None", "tuple[float, Array, bool]"]
 
 
 class ProfilePoint(NamedTuple):
@@ -40,6 +41,14 @@ class Profile(NamedTuple):
     points: list[ProfilePoint]  # sorted by x
     low: float | None  # lower end of the 95 % interval, or None beyond the bounds
     high: float | None  # upper end, likewise
+
+
+def quadratic_profile(x: float, deviation: float, quantile: float) -> Profile:
+    """Return the quadratic approximation of a profile at x; `quantile`: half width of its interval [deviations]."""
+    # The limit bounds the plotted range of unidentified parameters.
+    step = min(deviation, 3.0)
+    points = [ProfilePoint(x + offset * step, offset) for offset in np.linspace(-3, 3, 25).tolist()]
+    return Profile(points, x - quantile * deviation, x + quantile * deviation)
 
 
 class Profiler:
@@ -111,9 +120,7 @@ class Profiler:
                 distance = min(distance * min(3.0, quantile / max(rise, 1e-3)), limit)
         return points
 
-    def _conditional_minimum(
-        self, n: int, x: Array, jacobian: Array
-    ) -> Generator[Array, Prediction | None, tuple[float, Array, bool]]:
+    def _conditional_minimum(self, n: int, x: Array, jacobian: Array) -> Minimum:
         """Minimise over the other parameters, and update the Jacobian.
 
         Return the cost, infinite if the run at x fails, its coordinates, and whether the search has converged.

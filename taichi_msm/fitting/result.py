@@ -194,20 +194,18 @@ class FitResult:
             chi_text = f", chi-square {self.chi_square:.3g} for {self.degrees_of_freedom} degrees of freedom"
         for fitted in self.tests:
             peak, frames = fitted.loading.peak, len(fitted.loading.force)
-            residual = (
-                f"{fitted.residual:.3g} N, {rounded(100 * fitted.residual / peak)} % of the peak, at {frames} frames"
-            )
+            share = rounded(100 * fitted.residual / peak)
+            residual = f"{fitted.residual:.3g} N, {share} % of the peak, at {frames} frames"
             noise = f"noise of the first {fitted.loading.test.noise_rows} rows {fitted.loading.noise:.2g} N"
             offset = f"offset {fitted.loading.offset:.3g} +- {rounded(fitted.offset_error)} N subtracted"
             details = f"{noise}, {offset}, contact at {1000 * fitted.contact:.4g} mm"
             lines.append(f"{fitted.loading.test.name}: residual {residual}; {details}{chi_text}")
         if not self.tests:
-            pairs = zip(self.observations, self.fitted, strict=True)
-            residuals = [
-                observed.format_residual(root_mean_square((fitted - observed.values)[observed.known]))
-                for observed, fitted in pairs
-            ]
-            lines.append(f"residual {', '.join(residuals)}{chi_text}")
+            texts = []
+            for observed, values in zip(self.observations, self.fitted, strict=True):
+                residual_size = root_mean_square((values - observed.values)[observed.known])
+                texts.append(observed.format_residual(residual_size))
+            lines.append(f"residual {', '.join(texts)}{chi_text}")
         lines += [str(item) for item in self.left_out]
         if self.mesh_error is not None:
             qualifier = "at most about " if any(probe.moved for probe in self.scene.probes) else ""

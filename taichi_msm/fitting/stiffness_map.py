@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -13,9 +13,9 @@ from taichi_msm.accuracy.mesh import coarser_plan
 from taichi_msm.errors import SceneError, StageProgressCallback
 from taichi_msm.fitting.checks import faults, faults_at_start
 from taichi_msm.fitting.observation import Array
-from taichi_msm.fitting.parameters import Bounds, Parameter, make_parameters, rounded
+from taichi_msm.fitting.parameters import Bounds, Parameter, Request, make_parameters, rounded
 from taichi_msm.fitting.points import PointModel, PointObservation
-from taichi_msm.fitting.predict import Prediction, mesh_error, without_outputs
+from taichi_msm.fitting.predict import FitProblem, Prediction, mesh_error, without_outputs
 from taichi_msm.fitting.profiles import ProfilePoint
 from taichi_msm.fitting.rejection import by_chi_square
 from taichi_msm.fitting.result import Estimate, FitResult, FittedMap
@@ -49,10 +49,10 @@ class MapSettings:
     force: Parameter | None  # component of a force, whose fitted factor scales all forces; None for fixed forces
 
 
-def map_settings(
-    scene: Scene, free: Sequence[str], bounds: Mapping[str, Bounds], resolution: int | None
-) -> MapSettings | None:
+def map_settings(request: Request) -> MapSettings | None:
     """Return the settings of a map, or None for a fit of numbers; raise a SceneError if they are invalid."""
+    (scene, free, bounds, _, method) = request
+    resolution = method.get("resolution")
     if KEY not in free:
         if resolution is not None:
             raise SceneError([f"--resolution {resolution}: only for a map; add --free {KEY}"])
@@ -86,9 +86,11 @@ def map_settings(
 
 
 def fit_map(
-    scene: Scene, observations: PointObservation, settings: MapSettings, image: str, progress: StageProgressCallback
+    scene: Scene, problem: FitProblem, settings: MapSettings, image: str, progress: StageProgressCallback
 ) -> FitResult:
     """Return the fit of a map; `image`: path of the map's picture in the fitted scene."""
+    (observations,) = problem.observations
+    assert isinstance(observations, PointObservation)
     plan = _with_stable_steps(check_scene(without_outputs(scene)), settings.limits[1])
     require_differentiable(plan)
     if invalid := list(_faults(observations, scene, settings)):
@@ -115,15 +117,15 @@ def fit_map(
     report_progress()
     at_frames = model.on_sheet(adjoint.run(grid.factors(start[:cell_count]), report_progress))
     initial = model.predict(at_frames)
-    if invalid := list(faults_at_start([observations], scene, Prediction((initial,), 0, model.motion(at_frames)))):
+    if invalid := list(faults_at_start(problem, scene, Prediction((initial,), 0, model.motion(at_frames)))):
         raise SceneError(invalid)
     mesh_shift = 0.0
     if (coarse_plan := coarser_plan(plan)) is not None:
         coarse_factors = MapGrid(settings.resolution, _cells(coarse_plan)).factors(start[:cell_count])
         coarse_model = PointModel(coarse_plan.scene, observations, coarse_plan.grid.frames + 1)
-        coarse_points = coarse_model.points(Adjoint(coarse_plan, device).run(coarse_factors, report_progress))
+        coarse_points = coarse_model.on_sheet(Adjoint(coarse_plan, device).run(coarse_factors, report_progress))
         # Richardson extrapolation of order 2, from half the cells per side.
-        differences = (coarse_model.observe(coarse_points) - initial)[observations.known] / 3.0
+        differences = (coarse_model.predict(coarse_points) - initial)[observations.known] / 3.0
         mesh_shift = float(np.sqrt(np.nanmean(differences**2)))
     sigma = math.hypot(observations.sigma, mesh_shift)
     force_limits = settings.force.limits if settings.force else None

@@ -40,8 +40,8 @@ MAX_WEIGHT_CHANGE = 2.0
 # Largest change of the log of a map cell by the linearised solution, at which a search starts.
 MAX_INITIAL_STEP = 1.0
 
-# Step of finite differences of the log of a map cell.
-DIFFERENCE_STEP = 1e-2
+# Smallest step of finite differences of the log of a map cell, as a single cell changes the observations little.
+MIN_DIFFERENCE_STEP = 1e-2
 
 
 class SmoothnessWeight(NamedTuple):
@@ -100,6 +100,7 @@ class MapSolution:
     choice: SmoothnessWeight
 
 
+@dataclass(eq=False)
 class MapSearch:
     """Estimation of a map.
 
@@ -107,46 +108,43 @@ class MapSearch:
     the last entry of x is the log of a common factor of all forces. An exception from `pause` ends the search.
     """
 
-    def __init__(
-        self,
-        adjoint: Adjoint,
-        model: PointModel,
-        observations: PointObservation,
-        sigma: float,
-        grid: MapGrid,
-        limits: tuple[float, float],
-        pause: Callable[[], None],
-        *,
-        force_limits: Bounds | None = None,
-    ) -> None:
-        self._adjoint, self._model, self._observations, self._sigma = adjoint, model, observations, sigma
-        self._grid, self._pause, self._cells = grid, pause, grid.resolution**2
-        extra_limits = [] if force_limits is None else [force_limits]
-        self._roughness = np.pad(grid.roughness(), (0, len(extra_limits)))
-        self._limits = np.array([limits] * self._cells + extra_limits).T
-        self.runs = 0
+    adjoint: Adjoint
+    model: PointModel
+    observations: PointObservation
+    sigma: float
+    grid: MapGrid
+    limits: Bounds
+    pause: Callable[[], None]
+    force_limits: Bounds | None = None
+    runs: int = 0
+
+    def __post_init__(self) -> None:
+        self._cells = self.grid.resolution**2
+        extra_limits = [] if self.force_limits is None else [self.force_limits]
+        self._roughness = np.pad(self.grid.roughness(), (0, len(extra_limits)))
+        self._limits = np.array([self.limits] * self._cells + extra_limits).T
 
     def predict(self, x: Array) -> tuple[Array, Array]:
         """Return predicted points [m], shape (N, T, 3), and values, shape (N, T, 3 or 2)."""
-        self._pause()
+        self.pause()
         self.runs += 1
-        cells, scene = x[: self._cells], with_scaled_forces(self._model.scene, x[self._cells :])
-        points = self._model.points(self._adjoint.run(self._grid.factors(cells), self._pause, scene))
-        predicted = self._model.observe(points)
-        if not np.isfinite(predicted[self._observations.known]).all():
+        cells, scene = x[: self._cells], with_scaled_forces(self.model.scene, x[self._cells :])
+        points = self.model.points(self.adjoint.run(self.grid.factors(cells), self.pause, scene))
+        predicted = self.observations.observe(self.model.scene, points)
+        if not np.isfinite(predicted[self.observations.known]).all():
             fault = "an observed point is behind the eye of the camera for some maps"
             remedy = "give NaN in its place, or narrower --bounds"
-            raise SceneError([f"{self._observations.name}: pixel: {fault}; {remedy}"])
+            raise SceneError([f"{self.observations.name}: pixel: {fault}; {remedy}"])
         return points, predicted
 
     def misfit(self, x: Array) -> tuple[float, Array]:
         """Return chi-square and its gradient by x."""
         points, predicted = self.predict(x)
-        residuals = np.where(self._observations.known, predicted - self._observations.values, 0.0) / self._sigma
-        gradient = self._adjoint.backward(self._model.backward(points, 2 * residuals / self._sigma), self._pause)
-        by_cells = self._grid.backward(x[: self._cells], gradient.maps["tissue.map"])
+        residuals = np.where(self.observations.known, predicted - self.observations.values, 0.0) / self.sigma
+        gradient = self.adjoint.backward(self.model.backward(points, 2 * residuals / self.sigma), self.pause)
+        by_cells = self.grid.backward(x[: self._cells], gradient.maps["tissue.map"])
         # The derivative of a force by the log of its factor is the force.
-        scene = with_scaled_forces(self._model.scene, x[self._cells :])
+        scene = with_scaled_forces(self.model.scene, x[self._cells :])
         totals = {f"probes.{n}.total": np.array(probe.total, np.float64) for n, probe in enumerate(scene.probes)}
         by_forces = sum(float(np.sum(gradient.numbers[key] * total)) for key, total in totals.items())
         return float((residuals**2).sum()), np.append(by_cells, [by_forces] * (len(x) - self._cells))
@@ -168,11 +166,12 @@ class MapSearch:
 
     def _linearise(self, x: Array) -> Linearisation:
         """Linearise at x by finite differences, a run per map cell."""
-        known, predicted = self._observations.known, self.predict(x)[1]
-        residuals = (predicted - self._observations.values)[known] / self._sigma
+        known, predicted = self.observations.known, self.predict(x)[1]
+        residuals = (predicted - self.observations.values)[known] / self.sigma
         jacobian = np.empty((residuals.size, len(x)))
-        for n, change in enumerate(DIFFERENCE_STEP * np.eye(len(x))):
-            jacobian[:, n] = (self.predict(x + change)[1] - predicted)[known] / (DIFFERENCE_STEP * self._sigma)
+        step = max(MIN_DIFFERENCE_STEP, self.observations.difference_step(self.model.scene))
+        for n, change in enumerate(step * np.eye(len(x))):
+            jacobian[:, n] = (self.predict(x + change)[1] - predicted)[known] / (step * self.sigma)
         information, slope = jacobian.T @ jacobian, jacobian.T @ residuals
         min_chi_square = float(residuals @ residuals - slope @ np.linalg.pinv(information, hermitian=True) @ slope)
         variance = max(1.0, min_chi_square / max(1, residuals.size - len(x)))

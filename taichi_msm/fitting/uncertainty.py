@@ -129,9 +129,8 @@ def uncertainty(
     if error_correlation != (None, None):
         # U^T K U, and the effective number of observations tr(K)^2 / tr(K^2).
         pairs = zip(misfit.observations, misfit.split(singular.U), strict=True)
-        matrices, squares = zip(
-            *(observed.correlated(part, error_correlation) for observed, part in pairs), strict=True
-        )
+        parts = (observed.correlated(part, error_correlation) for observed, part in pairs)
+        matrices, squares = zip(*parts, strict=True)
         independent = min(len(singular.U) ** 2 / sum(squares), freedom)
         values, vectors = np.linalg.eigh(np.sum(matrices, axis=0))
         root = independent_root @ (vectors * np.sqrt(np.maximum(values, 0.0)))
@@ -180,15 +179,11 @@ def unidentified_groups(
     groups = [members[labels == label] for label in range(count)]
     pairs = zip(parameters, x.tolist(), uncertainties.deviations.tolist(), strict=True)
     errors = np.array([parameter.relative_error(coordinate, deviation) for parameter, coordinate, deviation in pairs])
-    return [
-        _describe_group(
-            [parameters[n] for n in group],
-            float(errors[group].max()),
-            list(_known_combinations(parameters, uncertainties, group, directions[group])),
-            "" if forces else ", or give a force (--forces)",
-        )
-        for group in groups
-    ]
+    described, remedy = [], "" if forces else ", or give a force (--forces)"
+    for group in groups:
+        known = list(_known_combinations(parameters, uncertainties, group, directions[group]))
+        described.append(_describe_group([parameters[n] for n in group], float(errors[group].max()), known, remedy))
+    return described
 
 
 def _known_combinations(

@@ -54,9 +54,8 @@ class SheetGradient:
         factors, material = plan.material.factors, plan.material
         assert factors is not None
         total = float(self.tensions @ material.tensions) + float(self.foundation.sum()) + self.bending
-        for by_spring, k, tension in zip(
-            self.springs, spring_stiffness(material, factors), material.tensions, strict=True
-        ):
+        stiffness = spring_stiffness(material, factors)
+        for by_spring, k, tension in zip(self.springs, stiffness, material.tensions, strict=True):
             total += float((by_spring * (k - tension)).sum())
         return total
 
@@ -117,10 +116,8 @@ def _coefficient_gradient(plan: Plan, gradient: SheetGradient) -> Array:
         for by_spring, share, tension in zip(gradient.springs, unit, tensions, strict=True)
     ]
     derivatives = [*springs, float(tensions @ (material.across, material.down, material.shear))]
-    derivatives += [
-        _from_logarithm(float(gradient.foundation.sum()), material.virtual),
-        _from_logarithm(gradient.bending, material.bending),
-    ]
+    derivatives.append(_from_logarithm(float(gradient.foundation.sum()), material.virtual))
+    derivatives.append(_from_logarithm(gradient.bending, material.bending))
     laws = (material.stiffening, gradient.stiffening), (material.virtual_stiffening, gradient.foundation_stiffening)
     for law, by_numbers in laws:
         if law:
@@ -185,10 +182,9 @@ class LoadGradient:
     def __init__(self, plan: Plan) -> None:
         self._plan = plan
         self.by_key: dict[str, Array] = {}
-        self._slots = {
-            index: [n for n, slot in enumerate(plan.slots) if slot.probe == index]
-            for index in sorted({slot.probe for slot in plan.slots})
-        }
+        self._slots: dict[int, list[int]] = {}  # of every probe, in the order of probes
+        for n, slot in sorted(enumerate(plan.slots), key=lambda item: item[1].probe):
+            self._slots.setdefault(slot.probe, []).append(n)
         for index in self._slots:
             probe = plan.scene.probes[index]
             self.by_key[f"probes.{index}.{_force_key(probe)}"] = np.zeros(3)
@@ -234,9 +230,7 @@ class LoadGradient:
             unit = np.zeros((ends[-1], 2))
             unit[key] = 1.0
             points = np.split(unit, ends[:-1])
-            segments = [
-                ProbeSegment(segment.times, positions) for segment, positions in zip(slot.segments, points, strict=True)
-            ]
+            segments = map(ProbeSegment, (segment.times for segment in slot.segments), points)
             slots.append(replace(slot, segments=tuple(segments)))
         return replace(plan, slots=tuple(slots))
 

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from taichi_msm.errors import ArgumentError, MsmError, Pause, SceneError, as_array, is_real_array
+from taichi_msm.errors import ArgumentError, Pause, SceneError, as_array, is_real_array
 from taichi_msm.gradients.chain_rule import Derivatives, scene_derivatives
 from taichi_msm.gradients.motion import MotionAdjoint, motion_bytes
 from taichi_msm.gradients.rest import RestAdjoint
@@ -28,12 +28,17 @@ from taichi_msm.terms import build_terms
 Array = NDArray[np.float64]
 
 
+_NUMBERS = "fit numbers instead of a map, or take finite differences"
+
+
 def require_differentiable(plan: Plan) -> None:
-    """Raise a SceneError if a scene has a position-controlled tool or another term without a gradient."""
+    """Raise a SceneError if a scene has a curved sheet, a position-controlled tool or a term without a gradient."""
+    if plan.scene.sheet.surface:
+        reason = "a sheet that is curved at rest has no gradient"
+        raise SceneError([f"sheet.surface: {reason}; {_NUMBERS}"])
     for tool in plan.tools:
         reason = "a tool with a path has no gradient, as its contact begins and ends"
-        remedy = "fit numbers instead of a map, or take finite differences"
-        raise SceneError([f"probes.{tool.probe}.path: {reason}; {remedy}"])
+        raise SceneError([f"probes.{tool.probe}.path: {reason}; {_NUMBERS}"])
     for term in build_terms(plan):
         if not term.has_gradient:
             reason = "has no gradient, which the fit of a map needs; remove it, or fit numbers"
@@ -77,53 +82,26 @@ class Adjoint:
             self._sheet = RestAdjoint(self._plan, device)
         else:
             self._sheet = MotionAdjoint(self._plan, device, cores=cores)
-        self._ran = False
 
     def run(self, factors: Array | None = None, pause: Pause = lambda: None, scene: Scene | None = None) -> Array:
         """Run the scene; return the positions at every frame [m], shape (F + 1, rows, cols, 3).
 
-        `factors` are the stiffness factors of the cells, shape (rows - 1, cols - 1), and `scene` is the plan's with
-        other forces of its probes; None for those of the plan. Factors that are invalid, or too large for the step,
-        raise an ArgumentError. An exception from `pause` ends the run, without derivatives.
+        `factors` are the stiffness factors of the cells, shape (rows - 1, cols - 1), for which the step is stable, and
+        `scene` is the plan's with other forces of its probes; None for those of the plan. An exception from `pause`
+        ends the run, without derivatives.
         """
-        self._ran = False
-        plan = self._plan if factors is None else self._with_factors(factors)
+        plan = self._plan
+        if factors is not None:
+            material = replace(plan.material, factors=factors)
+            limit = stable_step(material, plan.scene.sheet, plan.scene.time.damping_difference)
+            plan = replace(plan, material=material, stable_step=limit)
         plan = plan if scene is None else replace(plan, scene=scene)
         self._sheet.restart(plan)
-        displacements = self._sheet.run(pause)
-        self._ran = True
-        return rest_positions(plan.scene.sheet) + displacements
+        return rest_positions(plan.scene.sheet) + self._sheet.run(pause)
 
     def backward(self, by_position: Array, pause: Pause = lambda: None) -> Derivatives:
-        """Differentiate a loss at the last `run`, from its derivative by the positions, shape (F + 1, rows, cols, 3).
-
-        A `by_position` that is not an array of finite numbers of that shape raises an ArgumentError.
-        """
-        if not self._ran:
-            raise MsmError("no run to differentiate; call run first")
-        plan, by_position = self._sheet.plan, as_array(by_position, "slope")
-        shape = plan.grid.frames + 1, *plan.scene.sheet.points, 3
-        if not is_real_array(by_position, shape) or not np.isfinite(by_position).all():
-            raise ArgumentError(
-                f"the loss's derivative: {by_position.dtype} of shape {by_position.shape}; take finite numbers of "
-                f"shape {shape}, that of the positions"
-            )
-        return scene_derivatives(plan, *self._sheet.backward(np.asarray(by_position, float), pause))
-
-    def _with_factors(self, factors: Array) -> Plan:
-        plan, factors = self._plan, as_array(factors, "factors")
-        assert plan.material.factors is not None
-        shape, lower_bound = plan.material.factors.shape, plan.material.tension
-        if not is_real_array(factors, shape) or not (np.isfinite(factors) & (factors > lower_bound)).all():
-            raise ArgumentError(f"factors: take numbers above {lower_bound:g}, of shape {shape}")
-        material = replace(plan.material, factors=np.asarray(factors, float))
-        limit = stable_step(material, plan.scene.sheet, plan.scene.time.damping_difference)
-        if not plan.scene.time.at_rest and plan.grid.step > limit:
-            raise ArgumentError(
-                f"factors: up to {factors.max():g} need a step of {limit:.6g} s or less, and the scene's is "
-                f"{plan.grid.step:.6g} s; set a smaller time.step"
-            )
-        return replace(plan, material=material, stable_step=limit)
+        """Differentiate a loss at the last `run`, from its derivative by positions, shape (F + 1, rows, cols, 3)."""
+        return scene_derivatives(self._sheet.plan, *self._sheet.backward(by_position, pause))
 
 
 # Loss, a function of the positions at every frame. Returns its value, and its derivative in the shape of the positions.
@@ -188,5 +166,9 @@ def gradient(scene: Scene | Mapping[str, Any], loss: Loss, threads: int | None =
     if not is_real_array(array, ()) or not np.isfinite(array):
         description = f"an array of shape {array.shape}" if array.ndim else repr(value)
         raise ArgumentError(f"loss: its value is {description}; return a finite number")
-    derivatives = adjoint.backward(by_position)
+    slope = as_array(by_position, "slope")
+    if not is_real_array(slope, position.shape) or not np.isfinite(slope).all():
+        remedy = f"take finite numbers of shape {position.shape}, that of the positions"
+        raise ArgumentError(f"the loss's derivative: {slope.dtype} of shape {slope.shape}; {remedy}")
+    derivatives = adjoint.backward(np.asarray(slope, float))
     return Gradient(derivatives.numbers, derivatives.maps, float(value))

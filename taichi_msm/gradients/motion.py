@@ -127,7 +127,9 @@ class MotionAdjoint:
         for n in sorted(stops):
             self._forward.advance(n - self._forward.steps_done, pause)
             if n % self._segment == 0 and n < grid.steps:
-                self._store_checkpoint(n // self._segment)
+                sheet, first = self._forward.kernel.arrays, n // self._segment * self._step_entries
+                self._copy_step(0, first, sheet.u, self._checkpoints)
+                self._copy_step(0, first, sheet.d, self._checkpoint_differences)
             if n and n % grid.steps_per_frame == 0:
                 reading = self._forward.read()
                 fault = monitor.check_frame(reading)
@@ -170,7 +172,9 @@ class MotionAdjoint:
         for begin in reversed(range(first, end, self._segment)):
             self._store_history(begin, table[begin - first : stop - first], pause)
             while stop > begin:
-                start = self._launch_begin(begin, stop)
+                # A launch is within a segment and a frame.
+                frame = (stop - 1) // self.plan.grid.steps_per_frame * self.plan.grid.steps_per_frame
+                start = max(begin, frame, stop - self._max_launch_steps)
                 rows = slice(start - first, stop - first)
                 by_slot[rows] = self._sweep(begin, stop, by_frame, table[rows])
                 stop = start
@@ -184,11 +188,6 @@ class MotionAdjoint:
         work = (by_slot[..., :3] * average_loads(self.plan, first, end - first).strength).sum(axis=(1, 2))
         first_steps = 1 if first == 0 else 0
         return np.array([work[first_steps:].sum(), work[:first_steps].sum()])
-
-    def _store_checkpoint(self, segment: int) -> None:
-        sheet, first = self._forward.kernel.arrays, segment * self._step_entries
-        self._copy_step(0, first, sheet.u, self._checkpoints)
-        self._copy_step(0, first, sheet.d, self._checkpoint_differences)
 
     @property
     def _step_entries(self) -> int:
@@ -206,17 +205,11 @@ class MotionAdjoint:
         self._copy_step(checkpoint, 0, self._checkpoints, self._history)
         self._copy_step(checkpoint, 0, self._checkpoint_differences, self._differences)
         arrays = *self._history, *self._differences, *self._sheet_arrays
-        max_steps = self._max_launch_steps()
-        for done in range(0, count, max_steps):
-            steps = min(max_steps, count - done)
+        for done in range(0, count, self._max_launch_steps):
+            steps = min(self._max_launch_steps, count - done)
             sizes = self._sizes(steps, done, self._segment * layout.rows)
             self._launch(kernels.build_store, sizes, table[done : done + steps], *arrays)
             pause()
-
-    def _launch_begin(self, first: int, end: int) -> int:
-        """Return the first step of the launch that ends at step `end`, in the same segment and frame."""
-        frame = (end - 1) // self.plan.grid.steps_per_frame * self.plan.grid.steps_per_frame
-        return max(first, frame, end - self._max_launch_steps())
 
     def _sweep(self, first: int, end: int, by_frame: Array, table: Array) -> Array:
         """Sweep backward from step `end` over the steps of a table of loads, within the segment that begins at `first`.
@@ -227,7 +220,9 @@ class MotionAdjoint:
         frame, steps_after_frame = divmod(end - count, grid.steps_per_frame)
         with_loss = steps_after_frame == 0
         if with_loss:
-            self._write_loss(by_frame[frame])
+            for c in range(3):
+                write_vectors(self._loss[c], to_lanes(layout, by_frame[frame][..., c]))
+            self._copy_step(0, kernels.LOSS * self._step_entries, self._loss, self._adjoint)
         moment_row = kernels.ADJOINT_PARTS * layout.rows
         sizes = self._sizes(count, end - first - 1, moment_row, buffer=self._buffer, with_loss=with_loss)
         columns = kernels.LOAD_DERIVATIVES * len(self.plan.slots)
@@ -236,12 +231,6 @@ class MotionAdjoint:
         self._launch(kernels.build_sweep, sizes, table, by_row, *arrays)
         self._buffer = (self._buffer + count) % 2
         return by_row[..., :columns].sum(axis=1).reshape(count, -1, kernels.LOAD_DERIVATIVES)
-
-    def _write_loss(self, by_displacement: Array) -> None:
-        """Write the derivative of the loss with respect to the displacements of a frame to the adjoint's arrays."""
-        for c in range(3):
-            write_vectors(self._loss[c], to_lanes(self.layout, by_displacement[..., c]))
-        self._copy_step(0, kernels.LOSS * self._step_entries, self._loss, self._adjoint)
 
     def _sheet_gradient(self, gain: float, work: Array) -> SheetGradient:
         """Collect the accumulated derivatives; `work` is the sum of `_sweep_block` over all blocks."""
@@ -269,6 +258,7 @@ class MotionAdjoint:
         arrays = self._forward.kernel.arrays
         return arrays.constants, arrays.by_column, arrays.fields
 
+    @property
     def _max_launch_steps(self) -> int:
         # 10 million steps of a mass point take about 0.1 s on one core.
         return max(1, 10_000_000 // (self.layout.rows * self.layout.cols))

@@ -86,10 +86,8 @@ class RestAdjoint:
             if p is None:
                 if not u.any():
                     continue  # A flat sheet remains flat with any material.
-                raise MsmError(
-                    f"frame {n} has no gradient: the sheet has no stiffness against some motion; give it a foundation, "
-                    "pretension or bending"
-                )
+                fault = f"frame {n} has no gradient: the sheet has no stiffness against some motion"
+                raise MsmError(f"{fault}; give it a foundation, pretension or bending")
             _add_springs(gradient, families, u, p)
             gradient.foundation_stiffening += [float((by * p[..., 2]).sum()) for by in of_foundation.by_numbers]
             gradient.foundation += (of_foundation.force * p).sum(axis=-1)
@@ -137,9 +135,8 @@ def _stiffness(
 
     shape = plan.scene.sheet.points
     number, axis = np.arange(plan.fixed.size).reshape(shape), np.arange(3)
-    total = sparse.diags(foundation.tangent.ravel()) + plan.material.bending * sparse.kron(
-        laplacian.T @ laplacian, sparse.identity(3)
-    )
+    bending = plan.material.bending * sparse.kron(laplacian.T @ laplacian, sparse.identity(3))
+    total = sparse.diags(foundation.tangent.ravel()) + bending
     for family in families:
         blocks = family.tangent(u).reshape(-1, 3, 3)
         p, q = (3 * number[end].reshape(-1, 1, 1) for end in (family.start, family.end))

@@ -27,7 +27,7 @@ class Fisheye(LensModel):
 
     name = "fisheye"
     meaning = "its fisheye model, with k1 to k4"
-    coefficients: ClassVar = {name: Coefficient("radial coefficient") for name in ("k1", "k2", "k3", "k4")}
+    coefficients: ClassVar = dict.fromkeys(("k1", "k2", "k3", "k4"), Coefficient("radial coefficient"))
 
     def build(self, operations: Operations) -> Callable[..., Any]:
         sqrt, arctan, maximum = operations.sqrt, operations.arctan, operations.maximum

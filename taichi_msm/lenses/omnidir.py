@@ -27,10 +27,8 @@ class Omnidir(LensModel):
     meaning = "its omnidirectional model, with xi, k1, k2, p1 and p2"
     coefficients: ClassVar = {
         "xi": Coefficient("distance of the centre of projection from that of the unit sphere", least=0.0, default=None),
-        "k1": Coefficient("radial coefficient"),
-        "k2": Coefficient("radial coefficient"),
-        "p1": Coefficient("tangential coefficient"),
-        "p2": Coefficient("tangential coefficient"),
+        **dict.fromkeys(("k1", "k2"), Coefficient("radial coefficient")),
+        **dict.fromkeys(("p1", "p2"), Coefficient("tangential coefficient")),
     }
 
     def build(self, operations: Operations) -> Callable[..., Any]:

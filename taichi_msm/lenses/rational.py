@@ -27,14 +27,11 @@ class Rational(LensModel):
     name = "pinhole"
     meaning = "OpenCV's rational model"
     coefficients: ClassVar = {
-        "k1": Coefficient("radial coefficient"),
-        "k2": Coefficient("radial coefficient"),
-        "p1": Coefficient("tangential coefficient"),
-        "p2": Coefficient("tangential coefficient"),
+        **dict.fromkeys(("k1", "k2"), Coefficient("radial coefficient")),
+        **dict.fromkeys(("p1", "p2"), Coefficient("tangential coefficient")),
         "k3": Coefficient("radial coefficient"),
         "k4": Coefficient("radial coefficient; of the rational model in the denominator"),
-        "k5": Coefficient("radial coefficient in the denominator"),
-        "k6": Coefficient("radial coefficient in the denominator"),
+        **dict.fromkeys(("k5", "k6"), Coefficient("radial coefficient in the denominator")),
     }
 
     def build(self, operations: Operations) -> Callable[..., Any]:

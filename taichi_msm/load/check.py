@@ -44,7 +44,7 @@ def validate(data: dict[str, Any]) -> tuple[Plan | None, list[Problem]]:
         scene, new_problems = parse_model(Scene, data)
         problems += new_problems
         if scene is not None:
-            plan, new_problems = _check_combinations(scene)
+            plan, new_problems = _check_combinations(scene, None, with_image=True)
             # If a section that determines the step was replaced, problems of the tools' speed are meaningless.
             replaced = {problem.path[0] for problem in problems} & {"sheet", "tissue", "springs", "time"}
             problems += [
@@ -68,9 +68,7 @@ def _with_file(problem: Problem, data: dict[str, Any]) -> Problem:
     return Problem(problem.path, f"{path}: {problem.message}") if isinstance(path, str) else problem
 
 
-def _check_combinations(
-    scene: Scene, maps: Maps | None = None, *, with_image: bool = True
-) -> tuple[Plan | None, list[Problem]]:
+def _check_combinations(scene: Scene, maps: Maps | None, *, with_image: bool) -> tuple[Plan | None, list[Problem]]:
     """Plan a scene, and check combinations of its keys; with `with_image`, also the image file."""
     plan, problems = try_plan(scene, maps)
     # Cameras look at the sheet at rest.
@@ -113,9 +111,8 @@ def _replace_faulty(data: dict[str, Any], problems: list[Problem]) -> dict[str, 
         # Without the cameras, an output of a stereo pair cannot be checked.
         stereo = {row.entry for row in OUTPUTS.values() if row.needs_stereo_pair}
         data = {**data, "output": [name for name in output if name not in stereo]}
-    valid = {name: value for name, value in data.items() if name not in faulty} | {
-        name: value for name, value in _REPLACEMENTS.items() if name in faulty
-    }
+    replacements = {name: value for name, value in _REPLACEMENTS.items() if name in faulty}
+    valid = {name: value for name, value in data.items() if name not in faulty} | replacements
     time = data.get("time")
     if "time" in faulty and isinstance(time, Mapping) and time.get("motion", "dynamic") != "dynamic":
         valid["time"] = {**valid["time"], "motion": "quasistatic"}

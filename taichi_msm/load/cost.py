@@ -22,6 +22,7 @@ import numpy as np
 from taichi_msm.accuracy.companions import choose_companion_runs
 from taichi_msm.errors import Problem, SceneError
 from taichi_msm.model.plan import Plan
+from taichi_msm.model.time_grid import DTYPES
 from taichi_msm.render import texture
 from taichi_msm.render.labels import LABELS
 from taichi_msm.scene.camera import Camera
@@ -66,6 +67,7 @@ FORCE_BYTES = 6 * 8  # values in the checkpoint
 
 # Numbers in memory per mass point.
 STATE_NUMBERS = 6  # displacement and last difference
+CURVED_NUMBERS = 8  # of a curved sheet: mobility, rest position, stiffness of four springs
 MAP_NUMBERS = {"map": 6, "foundation_map": 4}  # stiffness of three springs; factor of the foundation; temporary arrays
 OUTPUT_NUMBERS = 15  # copies at the start and for output
 
@@ -113,8 +115,7 @@ def step_entries(plan: Plan, frames: int) -> dict[str, Any]:
 def estimate_budget(plan: Plan) -> Budget:
     """Estimate the memory and disk space of a run."""
     scene, grid = plan.scene, plan.grid
-    rows, cols = scene.sheet.points
-    points, number_bytes = rows * cols, 4 if grid.precision == "f32" else 8
+    points, number_bytes = math.prod(scene.sheet.points), DTYPES[grid.precision].itemsize
     frames, (width, height) = grid.frames + 1, scene.render.size
     pixel_bytes = [OUTPUTS[name].pixel_bytes for folder in scene.folders.values() for name in folder]
     cameras = len(scene.render.all_cameras)
@@ -123,20 +124,23 @@ def estimate_budget(plan: Plan) -> Budget:
     track_bytes = scene.render.tracks**2 * (frames * TRACK_BYTES + 16) + FILE_BYTES if "tracks" in scene.output else 0
     track_bytes *= cameras
     force_rows = frames * len(scene.probes)
+    surface = scene.sheet.surface
+    file_bytes = surface.file.values.nbytes if surface and surface.file else 0
     memory_numbers = len(memory_names(plan))
     numbers = STATE_NUMBERS + OUTPUT_NUMBERS + memory_numbers + sum(MAP_NUMBERS[name] for name in scene.maps)
+    numbers += CURVED_NUMBERS * (surface is not None)
     numbers += sum(not probe.moved for probe in scene.probes)  # the load of each force-controlled tool
     # Companion runs add up to two sheets in f64, and with tissue two smaller ones.
     has_companions = scene.time.tolerance is not None or choose_companion_runs(plan).planned
     bytes_per_number = number_bytes + (8 * (2 + (scene.tissue is not None) * 5 / 16) if has_companions else 0)
     return Budget(
         frames=frames,
-        simulation_bytes=round(points * bytes_per_number * numbers),
+        simulation_bytes=round(points * bytes_per_number * numbers) + file_bytes,
         drawing_bytes=drawing_bytes(scene) if scene.renders else 0,
         track_bytes=track_bytes,
         picture_bytes=math.ceil(frames * frame_bytes),
         trajectory_bytes=position_bytes + 8 * frames + FILE_BYTES if "trajectory" in scene.output else 0,
-        rest_bytes=REST_BYTES * points + FILE_BYTES if scene.sheet.surface else 0,
+        rest_bytes=REST_BYTES * points + FILE_BYTES if surface else 0,
         force_bytes=force_rows * FORCE_ROW_BYTES + FILE_BYTES if "forces" in scene.output else 0,
         record_bytes=2 * len(scene.model_dump_json(indent=2)) + RECORD_BYTES,
         # Two states (the saved one and its replacement), and the positions and forces of all frames.
@@ -193,7 +197,6 @@ def require_disk(plan: Plan, directory: Path) -> None:
 
 def drawing_bytes(scene: Scene) -> int:
     """Estimate the memory for drawing a frame [bytes], also for scenes without pictures in their output."""
-    rows, cols = scene.sheet.points
     width, height = scene.render.size
     # The whole image is decoded, even if only a region of it is used.
     image_pixels = math.prod(texture.image_size(scene) or (0,))
@@ -208,7 +211,8 @@ def drawing_bytes(scene: Scene) -> int:
     pixel_bytes += sum(LABEL_PLANE_BYTES * len(label.planes) for label in optional_labels)
     pixel_bytes += VIDEO_PIXEL_BYTES if "mp4" in scene.output else 0
     pixels = width * height * len(cameras)
-    return rows * cols * POINT_BYTES + sample_bytes + pixels * pixel_bytes + image_pixels * IMAGE_PIXEL_BYTES
+    point_bytes = math.prod(scene.sheet.points) * POINT_BYTES
+    return point_bytes + sample_bytes + pixels * pixel_bytes + image_pixels * IMAGE_PIXEL_BYTES
 
 
 def _free_disk(directory: Path) -> int:

@@ -23,28 +23,30 @@ from taichi_msm.scene.section import MAX_PATH, format_value
 # Largest size of a file [bytes].
 MAX_BYTES = 2**20
 
-# Keys whose values are paths of pictures, or of arrays of a surface.
+# Keys whose values are paths of pictures.
 IMAGE_KEY: Key = ("image",)
 MAP_KEYS: tuple[Key, ...] = (
     ("tissue", "map", "image"),
     ("tissue", "foundation_map", "image"),
     ("springs", "map", "image"),
 )
+PICTURE_KEYS = (IMAGE_KEY, *MAP_KEYS)
+
+# Keys of the heights and points of a surface, whose values are paths of arrays, of heights also of pictures.
 SURFACE_KEYS: tuple[Key, ...] = (("sheet", "surface", "height", "file"), ("sheet", "surface", "points", "file"))
-PICTURE_KEYS = (IMAGE_KEY, *MAP_KEYS, *SURFACE_KEYS)
 
 # Keys of a camera whose values are paths of files.
 CAMERA_FILE_KEYS = ("calibration", "poses")
+
+# Kind of a scene file and its required keys, for `read_file`.
+SCENE = "scene", "sheet, tissue or springs, and time"
 
 # Limit of the lines of an error, as a broken file may have tens of thousands of problems.
 MAX_LINES = 100
 
 
-class FileKind(NamedTuple):
-    """Kind of a YAML file: its name and its required keys, for messages."""
-
-    name: str  # such as "scene"
-    needs: str  # list of the required keys
+# Replacements of values of a file, as texts "KEY=VALUE" or by key.
+Overrides = Sequence[str] | Mapping[str, Any]
 
 
 class ParsedFile(NamedTuple):
@@ -55,12 +57,7 @@ class ParsedFile(NamedTuple):
     document: Document
 
 
-SCENE_KIND = FileKind("scene", "sheet, tissue or springs, and time")
-
-
-def load_scene(
-    path: str | Path, overrides: Sequence[str] | Mapping[str, Any] = (), image: str | Path | None = None
-) -> Scene:
+def load_scene(path: str | Path, overrides: Overrides = (), image: str | Path | None = None) -> Scene:
     """Read and validate a scene file.
 
     Args:
@@ -87,20 +84,16 @@ def load_scene(
     return load_plan(path, overrides, image).scene
 
 
-def load_plan(
-    path: str | Path, overrides: Sequence[str] | Mapping[str, Any] = (), image: str | Path | None = None
-) -> Plan:
+def load_plan(path: str | Path, overrides: Overrides = (), image: str | Path | None = None) -> Plan:
     """Read and validate a scene file as `load_scene`, and plan the scene for a CPU."""
     if isinstance(path, Mapping):
         raise ArgumentError("path: a mapping; take the path of a scene file, or build Scene(**mapping)")
     require_type(path, str | Path, "path", "the path of a scene file")
     require_type(image, str | Path | None, "image", "the path of a picture or None")
-    return plan_file(read_file(str(path), SCENE_KIND), overrides, image)
+    return plan_file(read_file(str(path), *SCENE), overrides, image)
 
 
-def plan_file(
-    file: ParsedFile, overrides: Sequence[str] | Mapping[str, Any] = (), image: str | Path | None = None
-) -> Plan:
+def plan_file(file: ParsedFile, overrides: Overrides = (), image: str | Path | None = None) -> Plan:
     """Validate a parsed scene file as `load_scene`, and plan the scene for a CPU, with the SHA-256 of camera files."""
     if isinstance(overrides, str) or not (
         isinstance(overrides, (Sequence, Mapping)) and all(isinstance(item, str) for item in overrides)
@@ -110,13 +103,11 @@ def plan_file(
     if "scene" in draft.data and {"vary", "variables"} & draft.data.keys():
         raise SceneError([f"{file.name}:1:1: a sweep; use `taichi-msm sweep`"])
     parsed = (
-        starmap(_build_override, overrides.items())
-        if isinstance(overrides, Mapping)
-        else map(parse_override, overrides)
+        starmap(_to_override, overrides.items()) if isinstance(overrides, Mapping) else map(parse_override, overrides)
     )
     for override in parsed:
         draft.override(override)
-    for key in (*PICTURE_KEYS[image is not None :], *(key for key, _ in camera_files(draft.data))):
+    for key in (*PICTURE_KEYS[image is not None :], *SURFACE_KEYS, *(key for key, _ in camera_files(draft.data))):
         draft.resolve_path(key, file.folder)
     if image is not None:
         draft.override(Override(f"--image {truncate(str(image))}", IMAGE_KEY, str(image)))
@@ -130,7 +121,7 @@ def plan_file(
 def names_file(key: Key) -> bool:
     """Return whether a text at a key is the path of a file."""
     is_camera = key[:-1] == ("render", "camera") or (key[:2] == ("render", "cameras") and len(key) == 4)
-    return key in PICTURE_KEYS or (is_camera and key[-1] in CAMERA_FILE_KEYS)
+    return key in (*PICTURE_KEYS, *SURFACE_KEYS) or (is_camera and key[-1] in CAMERA_FILE_KEYS)
 
 
 def camera_files(data: Mapping[str, Any]) -> list[tuple[Key, str]]:
@@ -171,7 +162,7 @@ def parse_override(text: str) -> Override:
     return Override(name, path, document.data, faults)
 
 
-def _build_override(key: str, value: Any) -> Override:
+def _to_override(key: str, value: Any) -> Override:
     path = parse_key(key)
     name = f"override {truncate(key)}"
     if not path:
@@ -237,7 +228,7 @@ class Draft:
             message = f"{path} is not below the scene's folder; put {noun} there{remedy}"
             self.problems.append((self._origin(key), Problem(key, message)))
             del section[key[-1]]
-        elif key not in PICTURE_KEYS:
+        elif key[-1] in CAMERA_FILE_KEYS:
             # Validation would report only the first missing camera file.
             try:
                 actual_path(str(folder / path)).stat()
@@ -312,41 +303,41 @@ def is_below(path: Path, folder: Path) -> bool:
         return True
 
 
-def read_file(name: str, kind: FileKind) -> ParsedFile:
-    """Read and parse a YAML file of an expected kind, which must contain a mapping."""
+def read_file(name: str, kind: str, needs: str) -> ParsedFile:
+    """Read and parse a YAML file, which must contain a mapping; `kind` and `needs`, its keys, are for messages."""
     try:
         document = read_yaml(_read_text(name, kind))
     except UnreadableError as error:
         raise SceneError([f"{name}:{error.mark.line}:{error.mark.column}: {error}"]) from None
     if document.data is None:
-        raise SceneError([f"{name}:1:1: no keys; a {kind.name} needs at least {kind.needs}"])
+        raise SceneError([f"{name}:1:1: no keys; a {kind} needs at least {needs}"])
     if not isinstance(document.data, dict):
-        message = f"{format_value(document.data)} is not a {kind.name}; expected keys such as {kind.needs}"
+        message = f"{format_value(document.data)} is not a {kind}; expected keys such as {needs}"
         raise SceneError([f"{name}:1:1: {message}"])
     return ParsedFile(name, Path(name).parent, document)
 
 
-def _read_text(name: str, kind: FileKind) -> str:
+def _read_text(name: str, kind: str) -> str:
     path = Path(name)
     try:
         if irregular := irregular_kind(path):
-            raise SceneError([f"{name}: {irregular}; name a {kind.name} file"])
+            raise SceneError([f"{name}: {irregular}; name a {kind} file"])
         with path.open("rb") as file:
             raw = file.read(MAX_BYTES + 1).removeprefix(codecs.BOM_UTF8)
     except ValueError:
-        raise SceneError([f"{name}: not a path; name a {kind.name} file"]) from None
+        raise SceneError([f"{name}: not a path; name a {kind} file"]) from None
     except OSError as error:
         scenes = path.parent.glob("*.y*ml") if isinstance(error, FileNotFoundError) else ()
         hint = next((f"; did you mean '{scene}'?" for scene in scenes if scene.stem == path.stem), "")
         raise SceneError([f"{name}: {(error.strerror or str(error)).lower()}{hint}"]) from None
     if len(raw) > MAX_BYTES:
-        raise SceneError([f"{name}: larger than {MAX_BYTES // 2**20} MiB; a {kind.name} is smaller"])
+        raise SceneError([f"{name}: larger than {MAX_BYTES // 2**20} MiB; a {kind} is smaller"])
     try:
         return raw.decode()
     except UnicodeDecodeError as error:
         if path.suffix.lower() in PICTURE_SUFFIXES:
-            hint = " file, and pass the picture with --image" if kind is SCENE_KIND else ""
-            raise SceneError([f"{name}: a picture; name a {kind.name}{hint}"]) from None
+            hint = " file, and pass the picture with --image" if kind == "scene" else ""
+            raise SceneError([f"{name}: a picture; name a {kind}{hint}"]) from None
         valid = raw[: error.start].decode()
         mark = mark_at(valid, len(valid))
         raise SceneError([f"{name}:{mark.line}:{mark.column}: not UTF-8; save the file as UTF-8"]) from None

@@ -69,6 +69,11 @@ class Grid:
             letters, column = chr(ord("A") + column % 26) + letters, column // 26 - 1
         return f"{self.name}: {self.sheet}!{letters}{row + 1}"
 
+    def cell(self, row: int | None, column: int) -> str:
+        """Return a cell, empty beyond the end of a row, and of a missing row."""
+        cells = [] if row is None else self.rows[row]
+        return cells[column] if column < len(cells) else ""
+
     def merged_columns(self, row: int) -> list[int]:
         """Return the columns of a row that are merged with their right neighbours."""
         return [column for first, last, column in self.merged if first <= row <= last]

@@ -96,9 +96,8 @@ def find_approach(scene: Scene) -> Approach:
     if isinstance(tool, SolidTool):
         start = _first_contact(tool, direction, scene.sheet)
     if start is None:
-        raise SceneError(
-            [f"{key}: the line from its first to its farthest key misses the sheet; direct it at the sheet"]
-        )
+        fault = "the line from its first to its farthest key misses the sheet; direct it at the sheet"
+        raise SceneError([f"{key}: {fault}"])
     return Approach(tool.probe, start, direction, tool, scene.sheet)
 
 
@@ -179,11 +178,10 @@ def build_loading(
     if contact is None:
         contact = float(test.depth[0 if is_clamp else _contact_row(test, noise, peak)])
     if test.depth[peak] <= contact:
-        fault = (
-            f"the depth falls from {contact:.4g} to {test.depth[peak]:.4g} m while the force rises to "
-            f"{test.force[peak]:.4g} N: is its sign opposite to the motion of the tool?"
-        )
-        raise SceneError([f"{test.name}: {fault} Choose another depth by --columns, or change its sign"])
+        fall = f"the depth falls from {contact:.4g} to {test.depth[peak]:.4g} m"
+        question = f"the force rises to {test.force[peak]:.4g} N: is its sign opposite to the motion of the tool?"
+        remedy = "Choose another depth by --columns, or change its sign"
+        raise SceneError([f"{test.name}: {fall} while {question} {remedy}"])
     if rate is None and scene.time.at_rest and not (scene.tissue and scene.tissue.relaxation):
         frames, rate = _sample_in_depth(test, noise, contact, finds_contact=finds_contact)
     else:
@@ -233,11 +231,9 @@ def late_contact_note(loading: Loading, key: str) -> str | None:
     # Ten independent rows have a rank correlation above 0.55 with a probability of 0.015.
     if not (significant > 0.01 * loading.peak and correlation > 0.55):
         return None
-    return (
-        f"{test.name}: the force rises within the first {count} rows, so its noise, {loading.noise:.3g} N, is "
-        f"too large: the tool touches before {1000 * loading.contact:.4g} mm, where the force is {significant:.3g} N; "
-        f"find the depth by --free {key}, or give it by --contact"
-    )
+    fault = f"the force rises within the first {count} rows, so its noise, {loading.noise:.3g} N, is too large"
+    effect = f"the tool touches before {1000 * loading.contact:.4g} mm, where the force is {significant:.3g} N"
+    return f"{test.name}: {fault}: {effect}; find the depth by --free {key}, or give it by --contact"
 
 
 class _Frames(NamedTuple):
@@ -258,9 +254,8 @@ def _sample_in_depth(test: MachineTest, noise: float, contact: float, *, finds_c
         # The force of a ball rises with the cube of the depth or less, and exceeds the noise first at the contact.
         late = min((CONTACT_NOISES * noise / float(test.force[:last].max())) ** (1 / 3), MAX_CONTACT_SHARE)
         share += late / (1 - late)
-    depth = np.linspace(
-        max(contact - share * (deepest - contact), float(test.depth[:last].min())), deepest, DEPTH_FRAMES + 1
-    )
+    start = max(contact - share * (deepest - contact), float(test.depth[:last].min()))
+    depth = np.linspace(start, deepest, DEPTH_FRAMES + 1)
     half, order = 0.5 * (depth[1] - depth[0]), np.argsort(test.depth[:last], kind="stable")
     pressed = replace(test, time=test.time[order], depth=test.depth[order], force=test.force[order])
     frames = _means(pressed.depth, depth, half, pressed)

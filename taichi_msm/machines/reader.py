@@ -145,9 +145,8 @@ def cut_window(test: MachineTest, start: float, end: float) -> MachineTest:
 
 def _orient(test: MachineTest) -> MachineTest:
     """Flip signs so that the largest magnitudes are positive, and add a warning about torn tissue."""
-    depth, force = (
-        values if values[np.abs(values).argmax()] >= 0 else 0.0 - values for values in (test.depth, test.force)
-    )
+    columns = test.depth, test.force
+    depth, force = (each if each[np.abs(each).argmax()] >= 0 else 0.0 - each for each in columns)
     test, time, peak = replace(test, depth=depth, force=force), test.time, int(force.argmax())
     fallen = np.flatnonzero(force[peak:] < force[peak] / 2) + peak
     if not len(fallen) or not peak:
@@ -157,10 +156,8 @@ def _orient(test: MachineTest) -> MachineTest:
     growth = depth[fallen[0]] - depth[peak]
     if growth <= 0 or growth < speed / 2 * (time[fallen[0]] - time[peak]):
         return test
-    note = (
-        f"{test.name}: the force falls by half from {force[peak]:.4g} N at {time[peak]:.4g} s while the depth grows: "
-        f"{TORE}; --window {time[0]:.4g},{time[peak]:.4g} cuts the table there"
-    )
+    fall = f"the force falls by half from {force[peak]:.4g} N at {time[peak]:.4g} s while the depth grows"
+    note = f"{test.name}: {fall}: {TORE}; --window {time[0]:.4g},{time[peak]:.4g} cuts the table there"
     return replace(test, notes=(*test.notes, note))
 
 
@@ -207,13 +204,10 @@ def _find_blocks(grid: Grid, chosen: dict[str, str], min_rows: int = MIN_ROWS) -
     for header, end in pairwise([*headers, len(grid.rows)]):
         rows = [n for n in range(header + 1, end) if grid.has_content(n)]
         candidates = _find_candidates(grid.rows[header], chosen)
-        first = grid.rows[rows[0]] if rows else []
-        has_units = any(
-            index < len(first) and _unit_factor(quantity, first[index]) is not None
-            for quantity, columns in candidates.items()
-            for index in columns
-        )
-        units, rows = (rows[0], rows[1:]) if has_units else (None, rows)
+        first = rows[0] if rows else None
+        pairs = ((quantity, index) for quantity, columns in candidates.items() for index in columns)
+        has_units = any(_unit_factor(quantity, grid.cell(first, index)) is not None for quantity, index in pairs)
+        units, rows = (first, rows[1:]) if has_units else (None, rows)
         counts = [sum(parse_number(cell) is not None for cell in grid.rows[n]) for n in rows]
         if sum(count >= len(WORDS) for count in counts) >= min_rows:
             blocks.append(_Block(header, units, rows, end))
@@ -250,11 +244,8 @@ def _named_quantities(title: str) -> frozenset[str]:
     # Without closing brackets, `BRACKETS` takes quadratic time.
     end = max(title.rfind(")"), title.rfind("]")) + 1
     words = WORD.findall((BRACKETS.sub(" ", title[:end]) + title[end:]).casefold())
-    return frozenset(
-        quantity
-        for quantity, ending in ENDINGS.items()
-        if WORDS[quantity] & {*words} or any(word.endswith(ending) for word in words)
-    )
+    by_ending = {quantity for quantity, ending in ENDINGS.items() if any(word.endswith(ending) for word in words)}
+    return frozenset(by_ending | {quantity for quantity, known in WORDS.items() if known & {*words}})
 
 
 def _fold(text: str) -> str:
@@ -315,18 +306,17 @@ def _select_columns(grid: Grid, block: _Block, chosen: dict[str, str]) -> tuple[
     Of several candidates, the one nearest 0 in the first row is selected.
     """
     header, titles = block.header, grid.rows[block.header]
-    units = grid.rows[block.units] if block.units is not None else []
-    first = grid.rows[block.rows[0]] if block.rows else []
+    first = block.rows[0] if block.rows else None
 
     def first_size(column: _Column) -> float:
-        number = parse_number(first[column.index]) if column.index < len(first) else None
+        number = parse_number(grid.cell(first, column.index))
         return math.inf if number is None else abs(number[0]) * column.scale
 
     selected, notes = [], []
     for quantity, candidates in _find_candidates(titles, chosen).items():
         given, columns = _split_choice(chosen.get(quantity, ""), quantity)[1], []
         for index in candidates:
-            scale = _unit_factor(quantity, units[index]) if index < len(units) else None
+            scale = _unit_factor(quantity, grid.cell(block.units, index))
             if scale is None:
                 scale = _split_title(titles[index], quantity)[1]
             if given is not None and scale not in (None, given):
@@ -346,7 +336,7 @@ def _select_columns(grid: Grid, block: _Block, chosen: dict[str, str]) -> tuple[
             raise SceneError([f"{grid.place(header, best.index)}: {best.title}: {fault}"])
         if best.index in grid.merged_columns(header):
             raise SceneError([_describe_merged(grid, header, best.index)])
-        unit = units[best.index] if best.index < len(units) else ""
+        unit = grid.cell(block.units, best.index)
         title_scale, scale = _split_title(best.title, quantity)[1], _unit_factor(quantity, unit)
         if given is None and unit and title_scale not in (None, scale):
             reason = f"not a unit of {quantity}; so it is in that of its title" if scale is None else "its unit"
@@ -403,7 +393,7 @@ def _rows_of_numbers(grid: Grid, block: _Block, columns: list[_Column]) -> Itera
         elif text is None:
             grid.require_width(n, block.header)
             for column in columns:
-                if column.index >= len(row) or not row[column.index]:
+                if not grid.cell(n, column.index):
                     fault = "empty"
                     if not grid.sheet and column.index >= len(row):
                         fault += f": the row has {len(row)} of {len(names)} cells, separated by {grid.separator}"

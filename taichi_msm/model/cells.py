@@ -70,30 +70,31 @@ def cell_stiffness(cells: Cells, membrane: Array | float) -> CellStiffness:
 def isotropy_errors(cells: Cells) -> Array:
     """Return the largest |energy of the springs / energy of plane stress - 1| of each cell over all strains.
 
-    The energies are quadratic forms of the strain with the components a . E a, b . E b and a . E b, in which springs
-    have a.Ea and b.Eb squared, and (a +- b) . E (a +- b) squared.
+    In axes with the first one along a, the strain has the parts e = (E11 + E22) / 2, f = (E11 - E22) / 2 and g = E12.
+    A spring along (x, y) is stretched by (x^2 + y^2) e + (x^2 - y^2) f + 2 x y g over its length. Twice the energy of
+    plane stress with nu = 1/3 is E t (3 e^2 + 3/2 f^2 + 3/2 g^2) per area.
     """
-    k, (p, q, c) = cell_stiffness(cells, 1.0), (cells.side_a, cells.side_b, cells.cosine)
-    springs = np.zeros((*c.shape, 3, 3))
-    for stiffness, direction in (
-        (2 * k.along_a, (1, 0, 0)),
-        (2 * k.along_b, (0, 1, 0)),
-        (k.falling, (1, 1, 2)),
-        (k.rising, (1, 1, -2)),
-    ):
-        springs += stiffness[..., None, None] * np.outer(direction, direction)
-    # Strains in orthonormal axes: e1 along a, e2 towards b.
-    s = np.sqrt(1 - c * c)
-    to_axes = np.zeros((*c.shape, 3, 3))  # (a.Ea, b.Eb, a.Eb) of (E11, E22, E12)
-    to_axes[..., 0, 0] = p * p
-    to_axes[..., 1, :] = np.stack([(q * c) ** 2, (q * s) ** 2, 2 * q * q * c * s], axis=-1)
-    to_axes[..., 2, :] = np.stack([p * q * c, np.zeros_like(c), p * q * s], axis=-1)
-    # Plane stress, nu = 1/3, twice the energy per E t: 9/8 (E11^2 + E22^2 + 2/3 E11 E22) + 3/2 E12^2.
-    stress = np.array([[9 / 8, 3 / 8, 0], [3 / 8, 9 / 8, 0], [0, 0, 3 / 2]])
-    inverse_root = np.linalg.inv(np.linalg.cholesky(stress))
-    of_strains = to_axes.swapaxes(-1, -2) @ springs @ to_axes / cells.area[..., None, None]
-    ratios = np.linalg.eigvalsh(inverse_root @ of_strains @ inverse_root.T)
-    return np.asarray(np.abs(ratios - 1).max(axis=-1))
+    k, p, q, c = cell_stiffness(cells, 1.0), cells.side_a, cells.side_b, cells.cosine
+    x, y = q * c, q * np.sqrt(1 - c * c)
+    springs = ((2 * k.along_a, p, 0 * y), (2 * k.along_b, x, y), (k.falling, p + x, y), (k.rising, p - x, -y))
+    matrix = np.zeros((3, 3, *c.shape))  # of the ratio of both energies
+    for stiffness, d_x, d_y in springs:
+        parts = (d_x * d_x + d_y * d_y) / np.sqrt(3), (d_x * d_x - d_y * d_y) / np.sqrt(1.5), d_x * d_y / np.sqrt(0.375)
+        for i, j in np.ndindex(3, 3):
+            matrix[i, j] += stiffness / cells.area * parts[i] * parts[j]
+    return np.maximum(*(np.abs(value - 1) for value in _extreme_eigenvalues(matrix)))
+
+
+def _extreme_eigenvalues(matrix: Array) -> tuple[Array, Array]:
+    """Return the smallest and the largest eigenvalue of symmetric matrices, shape (3, 3, ...), by Cardano's formula."""
+    mean = np.trace(matrix) / 3
+    deviation = matrix - mean * np.eye(3).reshape(3, 3, *(1,) * mean.ndim)
+    size = np.sqrt((deviation**2).sum(axis=(0, 1)) / 6)
+    (a, b, c), (_, d, e), (_, _, f) = deviation
+    determinant = a * (d * f - e * e) - b * (b * f - c * e) + c * (b * e - c * d)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        angle = np.arccos(np.clip(np.nan_to_num(determinant / size**3 / 2), -1, 1)) / 3
+    return mean + 2 * size * np.cos(angle + 2 * np.pi / 3), mean + 2 * size * np.cos(angle)
 
 
 def sum_around_points(values: Array) -> Array:

@@ -168,7 +168,7 @@ class CurvedRest(Rest):
         self.cells = Cells.of(position)
         self.cell_area = float(self.cells.area.mean())
         self.cell_sides = float(self.cells.side_a.mean()), float(self.cells.side_b.mean())
-        sides = np.concatenate([self.cells.side_a.ravel(), self.cells.side_b.ravel()])
+        sides = np.concatenate([np.linalg.norm(np.diff(position, axis=n), axis=-1).ravel() for n in (0, 1)])
         self.shortest_side, self.longest_side = float(sides.min()), float(sides.max())
 
     @cached_property

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,9 +12,15 @@ from taichi_msm.errors import Problem
 from taichi_msm.images import PictureError
 from taichi_msm.model.rest import CurvedRest, rest_of
 from taichi_msm.scene.scene import Scene
+from taichi_msm.scene.section import MAX_POINTS
 
 # A sheet is refused if a larger share of its area than this has a larger isotropy error than that.
 MAX_COARSE_SHARE, MAX_ISOTROPY_ERROR = 0.1, 0.5
+
+FOLD_REMEDY = "take more sheet.points, or a smoother surface"
+
+# Smallest sine of the angle between the sides of a cell.
+MIN_SINE = 1e-6
 
 Array = NDArray[np.float64]
 
@@ -30,43 +37,51 @@ def surface_problems(scene: Scene) -> Iterator[Problem]:
         yield Problem(("sheet", "surface", *surface.file_key), str(error))
         return
     assert isinstance(rest, CurvedRest)
-    if (fault := _fold(rest)) or (scene.tissue is not None and (fault := _anisotropy(rest))):
+    if (fault := _fold(rest)) or (scene.tissue is not None and (fault := _anisotropy(rest, surface.kind))):
         yield Problem(key, fault)
     if scene.tissue is not None and scene.tissue.bending:
-        text = "needs a flat sheet; remove bending, or surface, as wide folds hold by pretension or foundation"
+        text = "needs a flat sheet; with sheet.surface take pretension or foundation instead, which also limit folds"
         yield Problem(("tissue", "bending"), text)
 
 
 def _fold(rest: CurvedRest) -> str:
     """Return the fault of a cell without area, or turned over relative to a neighbour; empty without one."""
-    normals = rest.cell_normals
-    is_flat = np.isnan(normals[..., 0])
-    if is_flat.any():
-        return f"the cell at {describe_place(is_flat)} has no area; move its corners apart"
+    normals, cells = rest.cell_normals, rest.cells
+    has_area = cells.area > MIN_SINE * cells.side_a * cells.side_b
+    if not has_area.all():
+        return f"the cell at {describe_largest(~has_area)} has no area; its corners must not be on a line"
     if (angle := neighbour_angles(normals)).max(initial=0.0) > 90:
-        return f"the cells at {describe_place(angle > 90)} are turned over; give a surface without folds that overlap"
+        return f"{describe_fold(angle)}, more than 90; {FOLD_REMEDY}"
     return ""
 
 
-def _anisotropy(rest: CurvedRest) -> str:
+def describe_fold(angles: Array) -> str:
+    """Describe the largest angle between neighbouring cells, from `neighbour_angles`."""
+    return f"the cell at {describe_largest(angles)} and the next one meet at {angles.max():.0f} degrees"
+
+
+def _anisotropy(rest: CurvedRest, kind: str) -> str:
     errors, area = rest.isotropy_errors, rest.cells.area
     share = float(area[errors > MAX_ISOTROPY_ERROR].sum() / area.sum())
     if share <= MAX_COARSE_SHARE:
         return ""
-    worst = np.unravel_index(int(errors.argmax()), errors.shape)
     return (
         f"{share:.0%} of the area is in cells with an isotropy error above {MAX_ISOTROPY_ERROR:g}, up to "
-        f"{errors.max():.3g} at row {worst[0]}, column {worst[1]}; {isotropy_remedy(rest)}"
+        f"{errors.max():.3g} at {describe_largest(errors)}; {isotropy_remedy(rest, kind)}"
     )
 
 
-def isotropy_remedy(rest: CurvedRest) -> str:
-    """Return the numbers of points with nearly square cells, or the advice for sheared cells."""
-    p, q = rest.cell_sides
-    if max(p / q, q / p) < 1.5:
-        return "its cells are sheared: give points along lines that cross at right angles"
-    rows, cols = (count - 1 for count in rest.position.shape[:2])
-    return f"try sheet.points: [{rows + 1}, {max(1, round(cols * p / q)) + 1}], with nearly square cells"
+def isotropy_remedy(rest: CurvedRest, kind: str) -> str:
+    """Return the numbers of points with nearly square cells, or the advice for sheared and uneven cells."""
+    (p, q), (rows, cols) = rest.cell_sides, (count - 1 for count in rest.position.shape[:2])
+    # Rhombi of more than 60 degrees are isotropic.
+    if np.median(np.abs(rest.cells.cosine)) <= 0.5 and max(p / q, q / p) >= 1.5:
+        finer = (rows, round(cols * p / q)) if p > q else (round(rows * q / p), cols)
+        if max(finer) < MAX_POINTS:
+            return f"try sheet.points: {[count + 1 for count in finer]}, with nearly square cells"
+    if kind == "points":
+        return "give points at even distances along lines that cross at right angles"
+    return "take a less steep surface, on which cells are sheared and stretched less"
 
 
 def neighbour_angles(normals: Array) -> Array:
@@ -78,7 +93,7 @@ def neighbour_angles(normals: Array) -> Array:
     return angles
 
 
-def describe_place(is_faulty: NDArray[np.bool_]) -> str:
-    """Return row and column of the first faulty cell."""
-    row, column = np.unravel_index(int(is_faulty.argmax()), is_faulty.shape)
+def describe_largest(values: NDArray[Any]) -> str:
+    """Return row and column of the first cell with the largest value, but for rounding."""
+    row, column = np.unravel_index(int((values >= (1 - 1e-9) * values.max()).argmax()), values.shape)
     return f"row {row}, column {column}"

@@ -174,6 +174,9 @@ def force_warnings(scene: Scene, records: Sequence[ProbeRecord]) -> Iterator[str
     """Yield warnings of probes whose forces on this sheet, from `probe_records`, do not add up to their `total`."""
     across, down = rest_of(scene.sheet).cell_sides
     cell = f"a cell of {across:.3g} x {down:.3g} m"
+    cause = f"the tool is narrower than {cell}"
+    if scene.sheet.surface:
+        cause = f"the surface has more area around it than a plane, or {cause}"
     for index, (probe, record) in enumerate(zip(scene.probes, records, strict=True)):
         if probe.moved:
             continue
@@ -185,6 +188,4 @@ def force_warnings(scene: Scene, records: Sequence[ProbeRecord]) -> Iterator[str
                 f"the sheet, wider than the sheet, or narrower than {cell}?"
             )
         elif requested > 0 and applied * MIN_FORCE_RATIO >= requested:
-            yield (
-                f"probes.{index}: {applied:.3g} N instead of its {requested:.3g} N, as the tool is narrower than {cell}"
-            )
+            yield (f"probes.{index}: {applied:.3g} N instead of its {requested:.3g} N, as {cause}")

@@ -157,6 +157,10 @@ class SolidTool(Tool):
         depth, *_ = self.shape.build_depth(NUMPY)(*r.T, *self.axis, self.length, self.radius)
         return bool((depth > -1e-6 * self.radius).any())
 
+    def point_spacing(self, sheet: Sheet) -> float:
+        """Return the largest distance of neighbouring mass points at rest that the tool may touch [m]."""
+        return rest_of(sheet).longest_side
+
     def gap(self, sheet: Sheet, t: float = 0.0) -> float:
         """Return the distance at a time [s] from the sheet at rest [m], negative inside the sheet."""
         return self.gap_at(self.path_at(np.array([t]))[0], sheet)
@@ -238,9 +242,8 @@ class FollowingTool(SolidTool):
 
     def path_at(self, t: Array) -> Array:
         points, normals, heights = self._follow(t)
-        # `tip_height` of each shape depends on the angle between its axis and N only, of a round one not even on it.
-        distinct = normals[:1] if self.shape.is_round else normals
-        tips = [tip_offset(self.shape, self.axis, self.radius, normal) for normal in distinct]
+        directions = normals[:1] if self.shape.is_round else normals  # The tip of a round shape has one height.
+        tips = np.array([tip_offset(self.shape, self.axis, self.radius, normal) for normal in directions])
         return points + (heights + tips)[:, None] * normals
 
     @cached_property
@@ -254,6 +257,15 @@ class FollowingTool(SolidTool):
         points, normals, heights = self._follow(np.array([t]))
         x, y, z = (points[0] + heights[0] * normals[0]).tolist()
         return x, y, z
+
+    def point_spacing(self, sheet: Sheet) -> float:  # noqa: ARG002
+        places = _interpolate(self.bends, self.times, self.places)
+        position, count = self.rest.position, np.array(self.rest.position.shape[1::-1]) - 1
+        # The cells under the path, and those next to them.
+        first, last = (np.clip(np.floor(places * count).astype(int) + n, 0, count) for n in (-1, 2))
+        windows = (position[i:k, j:m] for (j, i), (m, k) in zip(first, last + 1, strict=True))
+        sides = (np.linalg.norm(np.diff(window, axis=n), axis=-1) for window in windows for n in (0, 1))
+        return max(float(each.max(initial=0.0)) for each in sides)
 
     def direction_at(self, t: float) -> Array:
         return self._follow(np.array([t]))[1][0]
@@ -406,7 +418,6 @@ def min_steps_per_frame(tools: Sequence[Tool], grid: TimeGrid, min_steps: int) -
 def path_warnings(scene: Scene, tools: Sequence[Tool]) -> Iterator[str]:
     """Yield warnings of implausible paths and grips, of tools too thin for the mesh, and of tools that intersect."""
     rest, end, solids = rest_of(scene.sheet), scene.time.duration, solid_tools(tools)
-    spacing_max = rest.longest_side
     for n, tool in enumerate(tools):
         yield from tool.warnings(scene)
         if tool.times[-1] > end * (1 + 1e-9):
@@ -416,8 +427,10 @@ def path_warnings(scene: Scene, tools: Sequence[Tool]) -> Iterator[str]:
                 yield f"probes.{tool.probe}.grip begins at {begin:g} s, not before the end of the scene at {end:g} s"
             elif scene.time.at_rest and not grip_frames((begin, until), scene.time.frames_per_second):
                 yield f"probes.{tool.probe}.grip from {begin:g} to {until:g} s holds nothing: no frame is between them"
-        if n in solids and spacing_max > MAX_SPACING_RADII * (radius := solids[n].radius):
-            least = MAX_SPACING_RADII * radius
+        if n not in solids:
+            continue
+        spacing_max, radius = solids[n].point_spacing(scene.sheet), solids[n].radius
+        if spacing_max > (least := MAX_SPACING_RADII * radius):
             lengths = scene.sheet.size if rest.is_flat else [(n - 1) * spacing_max for n in scene.sheet.points]
             points = [int(np.ceil(length / least)) + 1 for length in lengths]
             affordable = math.prod(points) <= MAX_POINTS_RATIO * math.prod(scene.sheet.points)

@@ -86,9 +86,8 @@ def _cover_tile(
     config = ti.static(band.config)
     plane = ti.static(config.plane)
     below_diagonal = config.float_vector(ti.cast(lower, ti.f32)) > 0.5
-    triangle = ti.static(
-        geometry.triangle_at(x, y, quad_column, quad_row, 1.0 / band.subdivisions, below_diagonal, cell.patch)
-    )
+    quad_side = 1.0 / band.subdivisions
+    triangle = ti.static(geometry.triangle_at(x, y, quad_column, quad_row, quad_side, below_diagonal, cell.patch))
     s, t = geometry.on_triangle(x, y, triangle)
     if not cell.patch.invertible:
         inside = inside & geometry.is_within(s, t, enlargement, band.near, triangle)
@@ -410,9 +409,8 @@ def _store_surface(
         normal = _normal_at(across, along, cell, band)
         store_visible(entry + plane.light, visible, _headlight(normal, band.uniforms), samples)
     if ti.static(config.tissue):
-        size, side = _footprint(
-            entry, x, y, s, t, cell.texels_across * quad_side, cell.texels_down * quad_side, triangle, band
-        )
+        texels_x, texels_y = cell.texels_across * quad_side, cell.texels_down * quad_side
+        size, side = _footprint(entry, x, y, s, t, texels_x, texels_y, triangle, band)
         # At a fold the interpolated normal may point away from the camera; `side` flips it.
         normal = _normal_at(across, along, cell, band)
         for n in ti.static(range(3)):
@@ -430,6 +428,5 @@ def _store_surface(
             _distance_to_line(along, (quad_row + t_right) * quad_side, (quad_row + t_below) * quad_side),
         )
         half_width = uni.WIRE_WIDTH / 2 * config.supersample + 0.5
-        store_visible(
-            entry + plane.wire, visible, uni.WIRE_OPACITY * ti.max(ti.min(half_width - distance, 1.0), 0.0), samples
-        )
+        opacity = uni.WIRE_OPACITY * ti.max(ti.min(half_width - distance, 1.0), 0.0)
+        store_visible(entry + plane.wire, visible, opacity, samples)

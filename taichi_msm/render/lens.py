@@ -64,9 +64,8 @@ class Lens(NamedTuple):
                 break
             (a, b), (c, d) = np.moveaxis(jacobian, (-2, -1), (0, 1))
             with np.errstate(invalid="ignore", divide="ignore"):
-                step = np.stack(
-                    [d * residual[..., 0] - b * residual[..., 1], a * residual[..., 1] - c * residual[..., 0]], axis=-1
-                )
+                x, y = residual[..., 0], residual[..., 1]
+                step = np.stack([d * x - b * y, a * y - c * x], axis=-1)
                 points = points + step / (a * d - b * c)[..., None]
                 # Clamp to the limit: beyond it there may be a second solution.
                 points *= np.minimum(1, limit / np.linalg.norm(points, axis=-1, keepdims=True))

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from taichi_msm.model.crossings import cells_on_line
 from taichi_msm.model.rest import rest_of
 from taichi_msm.render.camera import View
 from taichi_msm.scene.sheet import Sheet
@@ -28,7 +29,7 @@ def pick(position: NDArray[np.floating], refine: int, view: View, pixel: Pair) -
     rows, cols = position.shape[:2]
     ray = view.centred_at(pixel)
     hits: list[tuple[float, Pair]] = []
-    cells = np.argwhere(_cells_on_ray(position, ray))
+    cells = np.argwhere(cells_on_line(position @ row[:3] + row[3] for row in ray.matrix[:2]))
     for first in range(0, len(cells), CELLS_PER_BATCH):
         i, j = cells[first : first + CELLS_PER_BATCH].T
         corners = np.stack([position[i + below, j + right] for below in (0, 1) for right in (0, 1)], axis=1)
@@ -50,7 +51,7 @@ def pick_at_rest(sheet: Sheet, refine: int, view: View, pixel: Pair) -> Pair | N
     point = intersect_rest_plane(view, pixel)
     if point is None:
         return None
-    across, down = rest.fractions(point).tolist()
+    across, down = rest.fractions(point.astype(np.float64)).tolist()
     return across, down
 
 
@@ -64,19 +65,6 @@ def intersect_rest_plane(view: View, pixel: Pair) -> Array | None:
         return None
     point: Array = np.asarray(np.linalg.solve(planar, -matrix[:2, 3]), dtype=float)
     return point if matrix[2] @ [*point, 0, 1] > view.near else None
-
-
-def _cells_on_ray(position: NDArray[np.floating], ray: View) -> NDArray[np.bool_]:
-    """Mark the cells in which a and b of `pick` may both be 0."""
-    rows, cols = position.shape[:2]
-    is_candidate = np.ones((rows - 1, cols - 1), dtype=bool)
-    for row in ray.matrix[:2]:
-        # Only one coordinate of a large sheet fits into the cache.
-        value = position @ row[:3] + row[3]
-        for half in (value <= 0, value >= 0):
-            rows_of_cells = half[:-1] | half[1:]
-            is_candidate &= rows_of_cells[:, :-1] | rows_of_cells[:, 1:]
-    return is_candidate
 
 
 def _hits_in_cells(

@@ -85,9 +85,11 @@ class Renderer:
         config_of = partial(drawing_config, scene, picture=scene.draws, labels=labels)
         return (*(config_of(lens=lens) for lens in lenses), scene.output)
 
-    def labels(self, shot: Shot) -> Labels:
-        """Return the labels of a shot, with normals."""
-        return self._labels(shot, LABELS)
+    def labels(self, shot: Shot, names: Collection[str] = tuple(LABELS)) -> Labels:
+        """Return the labels of a shot of these names, by default all."""
+        labels = self._rasterizer(picture=False, labels=names, view=shot.view).render(*shot).labels
+        assert labels is not None
+        return labels
 
     def flow(self, before: Labels, shot: Shot) -> Flow:
         """Compute the optical flow to a shot from the one with the labels `before`.
@@ -110,9 +112,8 @@ class Renderer:
         """
         points = as_array(coordinates, "coordinates")
         if not (is_real_array(points, (*points.shape[:1], 2)) and ((points >= 0) & (points <= 1)).all()):
-            raise ArgumentError(
-                f"coordinates: {points.dtype} of shape {points.shape}; take numbers from 0 to 1 of shape (n, 2)"
-            )
+            fault = f"{points.dtype} of shape {points.shape}"
+            raise ArgumentError(f"coordinates: {fault}; take numbers from 0 to 1 of shape (n, 2)")
         from taichi_msm.render.tracking import locate_points
 
         return locate_points(self.scene, points, shot)
@@ -128,7 +129,7 @@ class Renderer:
             labels = requested if scene.labels_pixels and is_single_sample else frozenset[str]()
             observed = self._rasterizer(picture=True, labels=labels, view=shot.view).render(*shot)
         if scene.labels_pixels and observed.labels is None:
-            observed = observed._replace(labels=self._labels(shot, requested))
+            observed = observed._replace(labels=self.labels(shot, requested))
         if observed.labels is not None and scene.asks_for("stereo") and shot.view.companion is not None:
             observed = observed._replace(stereo=self._stereo(observed.labels, shot))
         if before is not None and scene.asks_for("flow"):
@@ -149,11 +150,6 @@ class Renderer:
         from taichi_msm.render.tracking import compute_stereo
 
         return Stereo(disparity, *compute_stereo(self.scene, labels, shot))
-
-    def _labels(self, shot: Shot, names: Collection[str]) -> Labels:
-        labels = self._rasterizer(picture=False, labels=names, view=shot.view).render(*shot).labels
-        assert labels is not None
-        return labels
 
     def _rasterizer(
         self, style: Render | None = None, *, picture: bool, labels: Collection[str] = (), view: View

@@ -23,13 +23,13 @@ import errno
 import json
 import os
 import re
-import secrets
 import shutil
 import stat
 import sys
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
 from contextlib import AbstractContextManager, ExitStack, contextmanager, suppress
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any, BinaryIO, NamedTuple
 
 from taichi_msm.errors import DamagedError, FilesError, ForeignError
@@ -297,19 +297,15 @@ def hidden_folder(folder: Path) -> Iterator[Path]:
     """
     with ensured_folder(folder):
         _clear_abandoned(folder)
-        hidden = folder / f".partial-{secrets.token_hex(8)}"
-        hidden.mkdir()
-        try:
-            with lock_file(hidden / LOCK_FILE):
-                yield hidden
-        finally:
-            shutil.rmtree(hidden, ignore_errors=True)
+        temporary = TemporaryDirectory(prefix=".partial-", dir=folder, ignore_cleanup_errors=True)
+        with temporary as hidden, lock_file(Path(hidden, LOCK_FILE)):
+            yield Path(hidden)
 
 
 def _clear_abandoned(folder: Path) -> None:
     """Delete the hidden folders of killed processes."""
     for hidden in list(folder.iterdir()):
-        if re.fullmatch(r"\.partial-[0-9a-f]{16}", hidden.name) and entry_kind(hidden) == FOLDER:
+        if re.fullmatch(r"\.partial-[0-9a-z_]{8,16}", hidden.name) and entry_kind(hidden) == FOLDER:
             # Others are kept: locked or incomplete ones, those of other users, and those with foreign files.
             with suppress(OSError, FilesError):
                 pattern = r"lock|draft|picture|session|copy|animation\.(?:gif|mp4)|study\.(?:png|md|json)|sweep\.json"

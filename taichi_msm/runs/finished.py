@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import TypeAdapter
 
-from taichi_msm.errors import FilesError, MsmError, SceneError, require_path
+from taichi_msm.errors import FilesError, SceneError, require_path
 from taichi_msm.images import PictureError, file_sha256, read_rgb
 from taichi_msm.model.sheet import rest_positions
 from taichi_msm.render.camera import camera_problems
@@ -27,7 +27,7 @@ from taichi_msm.system.files import read_regular
 
 _DIGESTS, _OVERRIDES = TypeAdapter(dict[str, str]), TypeAdapter(list[str])
 
-RESTORE_PICTURE = "restore the original picture, or run the scene again"
+RESTORE_PICTURE = "restore the original file, or run the scene again"
 
 
 @dataclass(frozen=True)
@@ -81,18 +81,14 @@ class FinishedRun:
         """Return a context that raises a FilesError if another run replaces the results inside the block."""
         try:
             yield
-        except MsmError:
-            self._require_unchanged()
-            raise
-        self._require_unchanged()
-
-    def _require_unchanged(self) -> None:
-        # A new publication moves run.json away before other files.
-        data = b""
-        with suppress(OSError):
-            data = read_regular(self.directory / RUN_RECORD, MAX_RECORD_BYTES)
-        if data != self._record:
-            raise FilesError(f"{self.directory}: another run replaced these results while they were read; try again")
+        finally:
+            # A new publication moves run.json away before other files.
+            data = b""
+            with suppress(OSError):
+                data = read_regular(self.directory / RUN_RECORD, MAX_RECORD_BYTES)
+            if data != self._record:
+                fault = "another run replaced these results while they were read"
+                raise FilesError(f"{self.directory}: {fault}; try again")
 
     def require_same_pictures(self, *, drawn: bool) -> None:
         """Raise a FilesError unless the maps, and if `drawn` the picture, have the SHA-256 of the run."""

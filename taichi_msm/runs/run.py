@@ -37,7 +37,7 @@ from taichi_msm.load.check import check_scene
 from taichi_msm.load.resolve import resolve
 from taichi_msm.model.plan import Plan
 from taichi_msm.model.sheet import rest_positions
-from taichi_msm.model.tool_force import ProbeRecord, probe_records
+from taichi_msm.model.tool_force import probe_records
 from taichi_msm.render.camera import view_at
 from taichi_msm.render.labels import FrameOutputs
 from taichi_msm.render.notes import drawing_warnings
@@ -267,11 +267,10 @@ class _Run:
         companions = _choose_companions(context, resumed=self._resumed_frames > 0)
         self._error_estimator: RunErrorEstimator | None = None
         self._path_dependence = PathDependence(plan) if plan.scene.time.at_rest else None
-        requested = manifest.asks_estimate
-        self._seeks_second_solutions = self._path_dependence is not None and (
-            requested is True
-            or (requested is None and device.arch == "cpu" and self._path_dependence.affords(companions.cost))
-        )
+        self._seeks_second_solutions = manifest.asks_estimate
+        if self._path_dependence and self._seeks_second_solutions is None:
+            is_affordable = self._path_dependence.affords(companions.cost)
+            self._seeks_second_solutions = device.arch == "cpu" and is_affordable
         self._estimates = RunErrorEstimates(manifest.estimate, companions.reason, manifest.mesh)
         if companions.planned:
             try:
@@ -401,15 +400,10 @@ class _Run:
         manifest, plan, progress = self._context.manifest, self._context.plan, self._simulation.progress
         scene = plan.scene
         estimates = self._error_estimator.estimates if self._error_estimator else self._estimates
-        probes = [
-            ProbeRecord(
-                **record,
-                greatest_force=math.hypot(*peak.force),
-                greatest_force_vector=list(peak.force),
-                greatest_force_time=peak.time,
-            )
-            for record, peak in zip(probe_records(scene), self._simulation.felt.greatest, strict=True)
-        ]
+        probes = probe_records(scene)
+        for record, peak in zip(probes, self._simulation.felt.greatest, strict=True):
+            record["greatest_force"], record["greatest_force_vector"] = math.hypot(*peak.force), list(peak.force)
+            record["greatest_force_time"] = peak.time
         notes = [
             *run_warnings(plan, probes, progress, estimates, _runs_within_an_hour, _pixels_per_metre(scene)),
             *(self._path_dependence.warnings() if self._path_dependence else ()),
@@ -482,9 +476,8 @@ def _pixels_per_metre(scene: Scene) -> float | None:
     """Return the image scale at the centre of the sheet [px/m]; None without pictures or if it is out of view."""
     if not scene.renders:
         return None
-    centre, right, up = view_at(scene, 0.0, next(iter(scene.render.all_cameras))).pixels(
-        np.array([[0.0, 0, 0], [1e-4, 0, 0], [0, 1e-4, 0]])
-    )
+    points = np.array([[0.0, 0, 0], [1e-4, 0, 0], [0, 1e-4, 0]])
+    centre, right, up = view_at(scene, 0.0, next(iter(scene.render.all_cameras))).pixels(points)
     scale = float(max(np.linalg.norm(right - centre), np.linalg.norm(up - centre))) / 1e-4
     return scale if math.isfinite(scale) else None
 

@@ -504,10 +504,8 @@ class Simulation(AbstractContextManager["Simulation"]):
             raise
         reading = self._dynamics.read()
         self._require_no_fault(reading, self._monitor.check_frame(reading))
-        position = to_positions(reading.displacement, self.scene.sheet)
-        self._probe_forces = self._force_recorder.at_frame(
-            self._probe_forces, self.frame, position, self._dynamics.tool_forces()
-        )
+        position, forces = to_positions(reading.displacement, self.scene.sheet), self._dynamics.tool_forces()
+        self._probe_forces = self._force_recorder.at_frame(self._probe_forces, self.frame, position, forces)
         self._frame_positions = position
 
     def _snapshot(self) -> Snapshot:

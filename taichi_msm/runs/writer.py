@@ -159,10 +159,8 @@ class ResultWriter(AbstractContextManager["ResultWriter"]):
 
     def _write_forces(self) -> None:
         """Write the forces of all frames, as decimals that round-trip to float64."""
-        with (
-            create_file(self._publication.new_folder / OUTPUTS["forces"].path()) as file,
-            io.TextIOWrapper(file, encoding="ascii", newline="") as text,
-        ):
+        path = self._publication.new_folder / OUTPUTS["forces"].path()
+        with io.TextIOWrapper(create_file(path), "ascii", newline="") as text:
             rows = csv.writer(text, lineterminator="\n")
             rows.writerow(outputs.FORCES_HEADER)
             for frame in range(self.frames):

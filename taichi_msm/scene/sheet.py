@@ -6,7 +6,7 @@ import math
 from collections.abc import Collection, Mapping
 from typing import Annotated, Any, Literal
 
-from pydantic import Field, ValidationError, model_validator
+from pydantic import ConfigDict, Field, ValidationError, model_validator
 from typing_extensions import Self
 
 from taichi_msm.images import PictureError
@@ -32,6 +32,11 @@ from taichi_msm.scene.surface import PointGrid, RestSurface
 
 class Sheet(Section):
     """Sheet of mass points."""
+
+    # With surface.points, the size is not allowed, and the number of points is that of the file by default.
+    model_config = ConfigDict(
+        json_schema_extra={"required": [], "anyOf": [{"required": ["points", "size"]}, {"required": ["surface"]}]}
+    )
 
     points: tuple[NodeCount, NodeCount] = key(
         ...,
@@ -81,6 +86,11 @@ class Sheet(Section):
                 raise scene_fault(str(error), "surface", "points", "file") from None
             except ValidationError:
                 points = (2, 2)  # The faults of the section come alone.
+            if max(points) > MAX_POINTS:
+                text = (
+                    f"{grid.file} has {points[0]} x {points[1]} points; set sheet.points, at most {MAX_POINTS} a side"
+                )
+                raise scene_fault(text, "surface", "points", "file")
         return {**data, "points": points, "size": (1.0, 1.0)}
 
     @model_validator(mode="after")
@@ -92,12 +102,13 @@ class Sheet(Section):
             # It is not given.
             self.__pydantic_fields_set__.discard("size")
         if surface.tube and width > 2 * math.pi * abs(surface.tube.radius):
-            text = f"{surface.tube.radius:g} m is too small to roll {width:g} m; take {_radius(width / 2 / math.pi)}"
-            raise scene_fault(text, "surface", "tube", "radius")
+            radius = surface.tube.radius
+            text = f"{radius:g} m is too small to roll a width of {width:g} m"
+            raise scene_fault(f"{text}; {_remedy(radius, width / 2 / math.pi)}", "surface", "tube", "radius")
         if surface.dome and max(height, width) / 2 > math.pi / 4 * abs(surface.dome.radius):
-            text = f"{surface.dome.radius:g} m is too small for a side of {max(height, width):g} m"
-            remedy = f"take {_radius(2 * max(height, width) / math.pi)}, or a smaller sheet.size"
-            raise scene_fault(f"{text}; {remedy}", "surface", "dome", "radius")
+            radius, side = surface.dome.radius, max(height, width)
+            text = f"{radius:g} m is too small for a side of {side:g} m"
+            raise scene_fault(f"{text}; {_remedy(radius, 2 * side / math.pi)}", "surface", "dome", "radius")
         return self
 
     def _unused_keys(self) -> Collection[str]:
@@ -113,8 +124,10 @@ class Sheet(Section):
         return f"sheet.size: {height:g} x {width:g} m is large for tissue; {remedy}"
 
 
-def _radius(least: float) -> str:
-    return f"at least {least:.4g} m, or at most {-least:.4g} m"
+def _remedy(radius: float, least: float) -> str:
+    """Return the remedy for a radius of the right sign that is too small, with a number that 4 digits do not lower."""
+    limit = f"at least {1.0005 * least:.4g}" if radius > 0 else f"at most {-1.0005 * least:.4g}"
+    return f"take {limit} m, or a smaller sheet.size"
 
 
 class StiffnessMap(Section):

@@ -9,7 +9,7 @@ from typing import Annotated, Literal
 from pydantic import ConfigDict, Field, model_validator
 from typing_extensions import Self
 
-from taichi_msm.array_files import ArrayFile, read_array_file
+from taichi_msm.array_files import ArrayFile, quantum, read_array_file
 from taichi_msm.images import PICTURE_SUFFIXES, file_sha256, read_grey
 from taichi_msm.scene.section import MAX_MAGNITUDE, FilePath, NotNegative, Number, Positive, Section, key, scene_fault
 
@@ -46,7 +46,8 @@ class HeightField(Section):
             sha256, (black, white) = file_sha256(self.file), self.range
             grey = read_grey(self.file, sha256)
             largest = 65535 if grey.dtype.itemsize == 2 else 255
-            return ArrayFile(black + (white - black) / largest * grey, sha256, (white - black) / largest)
+            scale = (white - black) / largest
+            return ArrayFile(black + scale * grey, sha256, abs(scale) * quantum(grey))
         assert self.unit is not None
         return read_array_file(self.file, metres(self.unit), ("height", "z"), lambda shape: len(shape) == 2, "(h, w)")
 
@@ -141,9 +142,15 @@ class RestSurface(Section):
     points: PointGrid | None = key(None, "positions of a grid of points", "a mapping with file and unit")
 
     @property
+    def _given(self) -> list[str]:
+        """Names of the given kinds."""
+        # Iteration over a model would include its cached properties.
+        return [name for name in type(self).model_fields if getattr(self, name) is not None]
+
+    @property
     def kind(self) -> str:
         """Name of the kind."""
-        return next(name for name, value in self if value is not None)
+        return self._given[0]
 
     @cached_property
     def file(self) -> ArrayFile | None:
@@ -156,7 +163,7 @@ class RestSurface(Section):
         return (self.kind, "file") if self.height or self.points else ()
 
     def _unused_keys(self) -> Collection[str]:
-        return [name for name, value in self if value is None]
+        return type(self).model_fields.keys() - {self.kind}
 
     @property
     def path(self) -> str:
@@ -175,11 +182,10 @@ class RestSurface(Section):
 
     @model_validator(mode="after")
     def _check_one_kind(self) -> Self:
-        given = [name for name, value in self if value is not None]
-        if not given:
+        if not self._given:
             raise scene_fault("is empty; expected one of height, tube, dome, points")
-        if len(given) > 1:
-            raise scene_fault(f"conflicts with {given[0]}; remove one of them", given[1])
+        if len(self._given) > 1:
+            raise scene_fault(f"conflicts with {self.kind}; remove one of them", self._given[1])
         return self
 
 

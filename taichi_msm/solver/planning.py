@@ -50,6 +50,9 @@ F64_WORK = 2.0
 # Additional work of a step per moving control point, for bending, and per position-controlled tool.
 MOVING_LOAD_WORK, BENDING_WORK, CONTACT_WORK = 1.2, 1.0, 0.5
 
+# Additional work of a step of a curved sheet.
+CURVED_WORK = 0.6
+
 # Work of encoding a pixel, and of drawing a sample of a pixel.
 ENCODING_WORK, SAMPLE_WORK = 40.0, 6.0
 
@@ -64,6 +67,9 @@ MAX_COMPANION_FRACTION = 2 / 5
 
 # Range of lengths whose squares, and products of squares, f32 can represent [m].
 MIN_F32_LENGTH_M, MAX_F32_LENGTH_M = 1e-15, 1e17
+
+# Range of lengths whose fourth powers f32 can represent, as in the springs of a curved sheet [m].
+CURVED_F32_LENGTHS_M = 1e-9, 1e9
 
 # Prevents n + 1 steps due to rounding in a frame of exactly n stable steps.
 ROUNDING_MARGIN = 1 - 1e-12
@@ -97,6 +103,7 @@ def affords_companions(plan: Plan, companions: float) -> bool:
 def _stepping_work(plan: Plan) -> float:
     moving, points = sum(slot.moves for slot in plan.slots), plan.scene.sheet.points
     cost = 1 + MOVING_LOAD_WORK * moving + BENDING_WORK * (plan.material.bending > 0) + CONTACT_WORK * len(plan.tools)
+    cost += CURVED_WORK * (plan.scene.sheet.surface is not None)
     steps = float(plan.grid.steps)
     if plan.scene.time.at_rest:
         # Each evaluation is followed by an update of the positions, which takes as long as a step.
@@ -235,11 +242,12 @@ def precision_problems(plan: Plan) -> Iterator[Problem]:
     if plan.grid.precision == "f64":
         return
     rest, step, mass = rest_of(plan.scene.sheet), plan.grid.step, plan.material.mass
-    if rest.shortest_side < MIN_F32_LENGTH_M or rest.extent > MAX_F32_LENGTH_M:
+    least, most = (MIN_F32_LENGTH_M, MAX_F32_LENGTH_M) if rest.is_flat else CURVED_F32_LENGTHS_M
+    if rest.shortest_side < least or rest.extent > most:
         yield Problem(
             ("sheet", "size"),
             f"cells of {rest.shortest_side:g} m in a sheet of {rest.extent:g} m leave the range of f32, "
-            f"{MIN_F32_LENGTH_M:g} to {MAX_F32_LENGTH_M:g} m; take time.precision: f64",
+            f"{least:g} to {most:g} m; take time.precision: f64",
         )
     gain = step**2 / mass
     if not MIN_F32_LENGTH_M**2 < gain < MAX_F32_LENGTH_M**2:

@@ -268,9 +268,8 @@ class QuasiStatics(SheetSolver[Relaxation]):
     def _diverged(self, frame: int, residual: float, evaluations: int) -> DivergedError:
         plan, time = self.plan, frame / self.plan.grid.frames_per_second
         row, column, *_ = largest_displacement(self._read_arrays(differences=True)[0])
-        remedy = (
-            "the sheet may hang slack, fold or wrinkle; give it a foundation, pretension or bending, or take less load"
-        )
+        support = "a foundation or pretension" if plan.scene.sheet.surface else "a foundation, pretension or bending"
+        remedy = f"the sheet may hang slack, fold or wrinkle; give it {support}, or take less load"
         if not (plan.is_held or plan.material.virtual > 0):
             remedy = "nothing holds the sheet; fix a side, or give it a foundation"
         elif (self._touched().sum(axis=0) > 1).any():

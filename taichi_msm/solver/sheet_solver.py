@@ -218,7 +218,7 @@ def _initial_data(plan: Plan, layout: SheetLayout, state: State | None) -> Initi
         assert plan.material.springs.rest is not None
         fields.insert(0, np.moveaxis(plan.material.springs.rest, -1, 0))
     if config.by_point:
-        fields.insert(0, np.stack([mobility, plan.area_shares]))
+        fields.insert(0, np.stack([mobility] if config.by_area else [mobility, plan.area_shares]))
     all_fields = np.concatenate(fields)
     if state is not None and len(state.memory):
         all_fields[config.memory_fields] = state.memory

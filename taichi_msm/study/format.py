@@ -62,19 +62,13 @@ def machine_summary(study: Study) -> str:
 
 def markdown_table(head: Sequence[str], rows: Sequence[Sequence[str]], left_columns: Sequence[int] = ()) -> str:
     """Format a Markdown table, without a final line break; columns other than `left_columns` are right-aligned."""
-    widths = [max(len(row[column]) for row in [head, *rows]) for column in range(len(head))]
-    separator = [
-        "-" * width if column in left_columns else "-" * (width - 1) + ":" for column, width in enumerate(widths)
-    ]
-
-    def line(cells: Sequence[str]) -> str:
-        padded = [
-            cell.ljust(width) if column in left_columns else cell.rjust(width)
-            for column, (cell, width) in enumerate(zip(cells, widths, strict=True))
-        ]
-        return f"| {' | '.join(padded)} |"
-
-    return "\n".join([line(head), line(separator), *map(line, rows)])
+    columns = range(len(head))
+    widths = [max(len(row[column]) for row in [head, *rows]) for column in columns]
+    pad = [str.ljust if column in left_columns else str.rjust for column in columns]
+    separator = ["" if column in left_columns else ":" for column in columns]
+    lines = [[pad[column](row[column], widths[column]) for column in columns] for row in [head, *rows]]
+    lines.insert(1, [text.rjust(width, "-") for text, width in zip(separator, widths, strict=True)])
+    return "\n".join(f"| {' | '.join(line)} |" for line in lines)
 
 
 def format_table(measurements: Sequence[Any], columns: Columns, remark: Callable[[Any], str] | None = None) -> str:

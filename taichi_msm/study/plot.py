@@ -7,7 +7,7 @@ import warnings
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from itertools import cycle
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 from matplotlib import style
 from matplotlib.axes import Axes
@@ -35,7 +35,7 @@ from taichi_msm.plot_style import (
     VERMILION,
 )
 from taichi_msm.study.format import ErrorMeasurement, format_number, machine_summary
-from taichi_msm.study.result import DrawingMeasurement, Study
+from taichi_msm.study.result import DrawingMeasurement, Measurement, Study
 from taichi_msm.system.compiler import compiler_label
 
 # Colours encode the damping difference, dashes and markers the precision.
@@ -55,6 +55,8 @@ MARKERS = "osD^vPX"
 PANEL_MOSAICS = {1: "A", 2: "AB", 3: "AB;AC"}
 
 Panel = Callable[[Axes, Study], None]
+AnyMeasurement = ErrorMeasurement | DrawingMeasurement
+M = TypeVar("M", bound=AnyMeasurement)
 
 
 def plot(study: Study, path: Path) -> None:
@@ -65,28 +67,30 @@ def plot(study: Study, path: Path) -> None:
         _figure(study).savefig(path, format="png")
 
 
-def panels(study: Study) -> Iterator[Panel]:
-    """Yield the plot function of each panel that has data to plot."""
-    if any(_drawable(point.error) for point in study.stepping):
-        yield _plot_stepping
-    if any(_drawable(drawing.psnr) for drawing in study.drawing):
-        yield _plot_drawing
-    if any(_drawable(mesh.error) for mesh in study.points):
-        yield _plot_meshes
+def panels(study: Study) -> list[Panel]:
+    """Return the plot function of each panel that has data to plot."""
+    candidates = (_plot_stepping, study.stepping), (_plot_drawing, study.drawing), (_plot_meshes, study.points)
+    return [panel for panel, points in candidates if any(0 < _coordinates(point)[0] < math.inf for point in points)]
 
 
-def _drawable(value: float | None) -> bool:
-    """Return whether a value is on a logarithmic axis."""
-    return value is not None and 0 < value < math.inf
+def _coordinates(point: AnyMeasurement) -> tuple[float, float]:
+    """Return the error and the time [s] of a measurement, or for drawing the PSNR [dB] and the time [ms]."""
+    if isinstance(point, DrawingMeasurement):
+        return point.psnr or 0.0, 1e3 * point.seconds.median
+    return point.error or 0.0, point.seconds.median
+
+
+def _drawable(points: Iterable[M | None]) -> list[M]:
+    """Return the measurements whose error or PSNR is on a logarithmic axis."""
+    return [point for point in points if point is not None and 0 < _coordinates(point)[0] < math.inf]
 
 
 def _figure(study: Study) -> Figure:
-    study_panels = list(panels(study))
+    study_panels = panels(study)
     layout = PANEL_MOSAICS[len(study_panels)]
     width = TWO_COLUMN_WIDTH if len(study_panels) > 1 else ONE_COLUMN_WIDTH
     size = width, 4.2 * (layout.count(";") + 1) + 0.5
     figure = Figure(figsize=size, dpi=DPI, layout=ConstrainedLayoutEngine(w_pad=0.1, h_pad=0.1, wspace=0.05))
-
     state = " (interrupted)" if study.status == "interrupted" else ""
     figure.suptitle(f"{printable(study.scene)}: speed against error{state}", x=0.01, ha="left", parse_math=False)
     versions = study.machine["versions"]
@@ -120,20 +124,19 @@ def _plot_stepping(axes: Axes, study: Study) -> None:
         diverged = [point.seconds.median for point in points if point.error is None]
         right = axes.get_yaxis_transform()
         axes.plot([0.985] * len(diverged), diverged, "x", color=line["color"], transform=right)
-    best = study.best_stepping
-    if best is not None and _drawable(best.error):
-        axes.plot([best.error or 0.0], [best.seconds.median], **RECOMMENDED_MARKER)
+    for best in _drawable([study.best_stepping]):
+        axes.plot(*_coordinates(best), **RECOMMENDED_MARKER)
     _scale_errors(axes, study.stepping, study.tolerance)
     _legend(axes, [*handles, *_marker_legend(study)])
 
 
 def _plot_line(axes: Axes, points: Sequence[ErrorMeasurement], line: dict[str, Any], label: str) -> Line2D:
     """Plot a line through measurements; return its legend handle."""
-    points = [point for point in points if _drawable(point.error)]
-    _plot_times(axes, [point.error or 0.0 for point in points], points, line)
+    points = _drawable(points)
+    _plot_times(axes, points, line)
     for point in points:
         if not point.known:
-            axes.plot([point.error or 0.0], [point.seconds.median], **line | BOUND_MARKER, zorder=4)
+            axes.plot(*_coordinates(point), **line | BOUND_MARKER, zorder=4)
     return Line2D([], [], **line, label=label)
 
 
@@ -142,14 +145,14 @@ def _marker_legend(study: Study) -> Iterator[Line2D]:
     yield Line2D([], [], **TOLERANCE_LINE, label="tolerance")
     if study.best_stepping is not None:
         yield Line2D([], [], **RECOMMENDED_MARKER | {"ms": 8}, label="recommended")
-    if any(_drawable(point.error) and not point.known for point in study.stepping):
+    if any(not point.known for point in _drawable(study.stepping)):
         yield Line2D([], [], **LEGEND_MARKER | BOUND_MARKER, label="at most this error")
     if any(point.error is None for point in study.stepping):
         yield Line2D([], [], **LEGEND_MARKER | {"marker": "x"}, label="diverged")
 
 
 def _plot_drawing(axes: Axes, study: Study) -> None:
-    drawings = [drawing for drawing in study.drawing if _drawable(drawing.psnr)]
+    drawings = _drawable(study.drawing)
     axes.set(title="Drawing", xlabel="PSNR of the most deformed frame [dB]", ylabel="time of a frame [ms]")
     axes.margins(x=0.1)
     colours = dict(zip(sorted({drawing.supersample for drawing in drawings}), cycle(SUPERSAMPLE_COLOURS)))
@@ -157,12 +160,11 @@ def _plot_drawing(axes: Axes, study: Study) -> None:
     for supersample, colour in colours.items():
         series = [drawing for drawing in drawings if drawing.supersample == supersample]
         line = {"color": colour, "linewidth": 0.8}
-        _plot_times(axes, [drawing.psnr or 0.0 for drawing in series], series, line, 1e3)
+        _plot_times(axes, series, line, 1e3)
     for drawing in drawings:
         marker = {"color": colours[drawing.supersample], "marker": markers[drawing.refine], **BOUND_MARKER}
         axes.plot(*_coordinates(drawing), **marker, zorder=3)
-    best = study.best_drawing
-    if best is not None and _drawable(best.psnr):
+    for best in _drawable([study.best_drawing]):
         axes.plot(*_coordinates(best), **RECOMMENDED_MARKER)
     _scale(axes, "y", [1e3 * seconds for seconds in _extremes(drawings)], 0.8)
     handles = [Line2D([], [], color=colour, label=f"supersample {n}") for n, colour in colours.items()]
@@ -172,41 +174,31 @@ def _plot_drawing(axes: Axes, study: Study) -> None:
     _legend(axes, handles, 3)
 
 
-def _coordinates(drawing: DrawingMeasurement) -> tuple[float, float]:
-    return drawing.psnr or 0.0, 1e3 * drawing.seconds.median
-
-
 def _plot_meshes(axes: Axes, study: Study) -> None:
-    meshes = [mesh for mesh in study.points if _drawable(mesh.error)]
+    meshes = _drawable(study.points)
     axes.set(title="Points", ylabel="time of the scene [s]")
     axes.set_xlabel("error, as a fraction of the largest displacement")
-    axes.plot([mesh.error or 0.0 for mesh in meshes], [mesh.seconds.median for mesh in meshes], color=BLUE)
+    axes.plot(*zip(*map(_coordinates, meshes), strict=True), color=BLUE)
     handles = []
     for mesh, marker in zip(meshes, cycle(MARKERS)):
         line = {"color": BLUE, "linestyle": "none", "marker": marker} | ({} if mesh.known else BOUND_MARKER)
         role, bound = " (the scene)" if mesh is study.scene_mesh else "", "" if mesh.known else ", at most"
         handles.append(_plot_line(axes, [mesh], line, f"{mesh.name}{role}{bound}"))
         if (mesh.rows, mesh.cols) == study.recommended_points:
-            axes.plot([mesh.error or 0.0], [mesh.seconds.median], **RECOMMENDED_MARKER)
+            axes.plot(*_coordinates(mesh), **RECOMMENDED_MARKER)
     _scale_errors(axes, meshes, study.mesh_tolerance)
     _legend(axes, [*handles, Line2D([], [], **TOLERANCE_LINE, label="tolerance")])
 
 
-def _plot_times(
-    axes: Axes,
-    x: Sequence[float],
-    points: Sequence[ErrorMeasurement | DrawingMeasurement],
-    line: dict[str, Any],
-    scale: float = 1,
-) -> None:
+def _plot_times(axes: Axes, points: Sequence[AnyMeasurement], line: dict[str, Any], scale: float = 1) -> None:
     """Plot a line through the medians of the times, and thin bars from the fastest to the slowest time."""
-    times = [point.seconds for point in points]
+    x, times = [_coordinates(point)[0] for point in points], [point.seconds for point in points]
     axes.plot(x, [scale * each.median for each in times], **line, zorder=3)
     fastest, slowest = [scale * each.fastest for each in times], [scale * each.slowest for each in times]
     axes.vlines(x, fastest, slowest, color=line["color"], linewidth=0.7, alpha=0.6)
 
 
-def _extremes(points: Iterable[ErrorMeasurement | DrawingMeasurement]) -> Iterator[float]:
+def _extremes(points: Iterable[Measurement]) -> Iterator[float]:
     for point in points:
         yield from (point.seconds.fastest, point.seconds.slowest)
 
@@ -220,7 +212,7 @@ def _scale_errors(axes: Axes, points: Sequence[ErrorMeasurement], tolerance: flo
 
 def _scale(axes: Axes, axis: str, values: Iterable[float], min_decades: float) -> None:
     """Set a logarithmic scale of an axis, with a margin around the values and at least `min_decades` decades."""
-    exponents = [math.log10(value) for value in values if _drawable(value)]
+    exponents = [math.log10(value) for value in values if 0 < value < math.inf]
     low, high = min(exponents), max(exponents)
     margin = max(0.07 * (high - low), (min_decades - (high - low)) / 2)
     axes.set(**{f"{axis}scale": "log", f"{axis}lim": (10 ** (low - margin), 10 ** (high + margin))})

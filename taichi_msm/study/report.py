@@ -78,19 +78,17 @@ def _draw(study: Study, path: Path) -> bool:
     """Plot the figure if Matplotlib is installed and there are data to plot; return whether it was plotted."""
     try:
         from taichi_msm.study.plot import panels, plot
+
+        if panels(study):
+            plot(study, path)
+            return True
     except ImportError:
         if WITHOUT_MATPLOTLIB not in study.notes:
             study.notes.append(WITHOUT_MATPLOTLIB)
-        return False
-    if not any(panels(study)):
-        return False
-    try:
-        plot(study, path)
     except Exception as error:
         # A failing plot must not discard minutes of measurements.
         study.notes.append(f"study.png could not be drawn: {type(error).__name__}: {error}")
-        return False
-    return True
+    return False
 
 
 STEPPING_COLUMNS: Columns = {

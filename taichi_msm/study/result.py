@@ -182,13 +182,9 @@ class Study:
 
     def best_refinement(self, supersample: int) -> DrawingMeasurement | None:
         """Return the fastest refinement within 0.1 dB of the best with a supersampling; None if not measured."""
-        candidates = [
-            (math.inf if drawing.psnr is None else drawing.psnr, drawing)
-            for drawing in self.drawing
-            if drawing.supersample == supersample
-        ]
-        min_psnr = max((psnr for psnr, _ in candidates), default=0.0) - 0.1
-        sufficient = [drawing for psnr, drawing in candidates if psnr >= min_psnr]
+        drawings = [drawing for drawing in self.drawing if drawing.supersample == supersample]
+        qualities = [math.inf if drawing.psnr is None else drawing.psnr for drawing in drawings]
+        sufficient = [each for each, psnr in zip(drawings, qualities, strict=True) if psnr >= max(qualities) - 0.1]
         return min(sufficient, key=lambda drawing: drawing.seconds.median, default=None)
 
     def recommendation(self) -> list[str]:

@@ -43,13 +43,8 @@ def run_study(
         raise SceneError(["time.motion: quasistatic takes no steps, which a study compares; set time.motion: dynamic"])
     _require_memory(scene)
     texture = load_texture(scene) if scene.image is not None else None
-    results = Study(
-        scene=name,
-        settings=scene.model_dump(mode="json"),
-        status="complete",
-        tolerance=tolerance or scene.time.tolerance or 1e-3,
-        machine=machine_record(device),
-    )
+    tolerance = tolerance or scene.time.tolerance or 1e-3
+    results = Study(name, scene.model_dump(mode="json"), "complete", tolerance, machine_record(device))
     # Approximate time limit of a run of the whole scene [s].
     longest_run = 0.25 if quick else 2.0
     # No tolerance: the study varies the step itself.

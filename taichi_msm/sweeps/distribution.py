@@ -75,9 +75,7 @@ class Distribution(_Continuous):  # type: ignore[misc]
 
     model_config = ConfigDict(validate_default=False)
 
-    choice: NonEmptyList = key(
-        None, "one of some values, all equally likely; of a picture also a pattern of files", LIST
-    )
+    choice: NonEmptyList = key(None, "one of some values, all equally likely; of files also a pattern", LIST)
     grid: NonEmptyList = key(None, "every one of some values, with every combination of the other keys'", LIST)
 
     @model_validator(mode="before")

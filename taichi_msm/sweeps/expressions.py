@@ -17,13 +17,9 @@ from taichi_msm.errors import Key, did_you_mean, truncate
 # Largest number of characters; longer texts could nest deeper than Python's stack.
 MAX_LENGTH = 200
 
-FUNCTIONS: dict[str, Callable[..., float]] = {
-    "min": min,
-    "max": max,
-    "sqrt": math.sqrt,
-    "sin": math.sin,
-    "cos": math.cos,
-}
+Function = Callable[..., float]
+
+FUNCTIONS: dict[str, Function] = {"min": min, "max": max, "sqrt": math.sqrt, "sin": math.sin, "cos": math.cos}
 CONSTANTS = {"pi": math.pi}
 SYNTAX = f"numbers, + - * / ** ( ), {', '.join(FUNCTIONS)}, pi, and names of variables"
 
@@ -34,7 +30,7 @@ def _power(base: float, exponent: float) -> float:
     return int(result) if is_exact else result
 
 
-_OPERATORS: dict[type[ast.AST], Callable[..., float]] = {
+_OPERATORS: dict[type[ast.AST], Function] = {
     ast.Add: operator.add,
     ast.Sub: operator.sub,
     ast.Mult: operator.mul,
@@ -69,7 +65,7 @@ def evaluate(text: str, variables: Mapping[str, float]) -> float:
 def _value(node: ast.expr, names: Mapping[str, float]) -> float:
     """Return the value of a node, recursively."""
     values: list[float]
-    function: Callable[..., float]
+    function: Function
     match node:
         case ast.Constant(value=int() | float() as number) if not isinstance(number, bool):
             values, function = [number], operator.pos

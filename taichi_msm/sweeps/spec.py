@@ -94,9 +94,8 @@ class SweepSettings(Section):
                 raise scene_fault("is not a valid name; take letters, digits and _, such as x1", name)
             for value in distribution.values:
                 if isinstance(value, list) or not numbers(value):
-                    raise scene_fault(
-                        f"{format_value(value)} is not a number; variables are numbers", name, distribution.kind
-                    )
+                    fault = f"{format_value(value)} is not a number; variables are numbers"
+                    raise scene_fault(fault, name, distribution.kind)
         return variables
 
     @model_validator(mode="after")
@@ -105,20 +104,17 @@ class SweepSettings(Section):
         if not varied:
             raise scene_fault("no keys; name at least one, such as tissue.young: {uniform: [1e4, 3e4]}", "vary")
         if both := self.variables.keys() & self.vary.keys():
-            raise scene_fault(
-                "is also a key of vary, with its column in table.csv; take another name", "variables", min(both)
-            )
+            fault = "is also a key of vary, with its column in table.csv; take another name"
+            raise scene_fault(fault, "variables", min(both))
         grids = [name for name, distribution in varied.items() if distribution.kind == "grid"]
         if self.samples is not None and grids:
-            raise scene_fault(
-                f"{grids[0]} is a grid, which gives every combination; take choice, or leave out samples", "samples"
-            )
+            fault = f"{grids[0]} is a grid, which gives every combination; take choice, or leave out samples"
+            raise scene_fault(fault, "samples")
         if self.samples is None and len(grids) < len(varied):
             raise scene_fault("missing; expected the number of runs, as not every key is a grid", "samples")
         if self.runs > MAX_RUNS:
-            raise scene_fault(
-                f"{self.runs} combinations, more than the {MAX_RUNS} that can be run; take smaller grids", "vary"
-            )
+            fault = f"{self.runs} combinations, more than the {MAX_RUNS} that can be run; take smaller grids"
+            raise scene_fault(fault, "vary")
         if (count := sum(distribution.dimensions for distribution in varied.values())) > MAX_DIMENSIONS:
             raise scene_fault(f"{count} numbers, more than the {MAX_DIMENSIONS} that can vary; take fewer", "vary")
         keys = [_split_key(name) for name in (*self.set, *self.vary)]
@@ -248,7 +244,7 @@ class Sweep:
 
 def load_sweep(path: str | Path) -> Sweep:
     """Read and check a sweep file; raise a SceneError with a line for each error, in the order of the file."""
-    draft = scene_file.Draft(scene_file.read_file(str(path), scene_file.FileKind("sweep", "scene and vary")))
+    draft = scene_file.Draft(scene_file.read_file(str(path), "sweep", "scene and vary"))
     if "sheet" in draft.data and not {"vary", "variables"} & draft.data.keys():
         raise SceneError([f"{path}:1:1: a scene; use `taichi-msm run`, or name it by `scene:` in a sweep file"])
     sweep, problems = _check(draft.data, Path(path).parent)
@@ -285,7 +281,7 @@ def _check(data: dict[str, Any], folder: Path) -> tuple[Sweep | None, list[Probl
         problems += _relocate(vary, fixed, folder, path.parent)
         try:
             # A name without folder, as errors of runs must not depend on the current directory.
-            file = scene_file.read_file(_normalise(path), scene_file.SCENE_KIND)._replace(name=path.name)
+            file = scene_file.read_file(_normalise(path), *scene_file.SCENE)._replace(name=path.name)
             problems += _unknown_keys(file, vary, fixed)
         except SceneError as error:
             problems.append(Problem(("scene",), error.lines[0]))
@@ -362,12 +358,13 @@ def _relocate(vary: dict[str, Any], fixed: dict[str, Any], folder: Path, scene_f
 
 
 def _matching_files(pattern: str, folder: Path, key: Key) -> list[str]:
-    """Return the files that match a pattern relative to a folder; for a key of pictures, only pictures."""
+    """Return the files that match a pattern relative to a folder, and have a suffix for the key."""
     # `glob` calls itself for each folder, and takes quadratic time for brackets.
     if len(pattern) > MAX_PATH or pattern.count("/") > MAX_FOLDERS:
         return []
     suffixes: tuple[str, ...] = PICTURE_SUFFIXES if key in scene_file.PICTURE_KEYS else ("",)
-    suffixes += ARRAY_SUFFIXES if key in scene_file.SURFACE_KEYS else ()
+    if key in scene_file.SURFACE_KEYS:
+        suffixes = (*PICTURE_SUFFIXES, *ARRAY_SUFFIXES) if "height" in key else ARRAY_SUFFIXES
     names = sorted(glob(pattern, root_dir=folder))  # noqa: PTH207  # Path.glob refuses absolute patterns
     return [text for text in names if text.lower().endswith(suffixes) and (folder / text).is_file()]
 

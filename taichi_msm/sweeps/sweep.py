@@ -82,8 +82,7 @@ def sweep(
         (8, {'complete'})
     """
     require_path(directory)
-    if not isinstance(scene, (str, Path)):
-        raise ArgumentError(f"scene: {scene!r}; take the path of a scene file")
+    require_type(scene, (str, Path), "scene", "the path of a scene file")
     if workers is not None and not (type(workers) is int and 1 <= workers <= MAX_WORKERS):
         raise ArgumentError(f"workers: {workers!r}; take a whole number, 1 to {MAX_WORKERS}, or None")
     if executor is not None and not isinstance(executor, str) and not hasattr(executor, "submit"):

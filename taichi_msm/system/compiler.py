@@ -33,7 +33,8 @@ class Compiler:
     name: str  # name of its package, also in run.json
     title: str  # name in messages
     prefix: str  # prefix of its environment variables
-    lock: str  # lock file of the compiled kernels, relative to their directory
+    cache: str  # directory of compiled kernels, relative to the home directory
+    lock: str  # lock file of the cache, relative to that directory
     tested_version: str  # version with the same bits on a CPU as that of the other compiler
     python_versions: str  # versions of Python with wheels of it
     # Time to poll a counter that another thread writes [s], measured on Zen 4; Taichi fences the read by `mfence`,
@@ -62,9 +63,7 @@ class Compiler:
 
     def folder(self) -> Path:
         """Return the directory of compiled kernels."""
-        return Path(
-            os.environ.get(self.folder_variable) or Path.home() / f".cache/{self.name}/{self.prefix.lower()}cache"
-        )
+        return Path(os.environ.get(self.folder_variable) or Path.home() / self.cache)
 
     def load(self) -> Any:
         """Import the compiler, without its banner on stdout and its check for a newer version."""
@@ -136,6 +135,7 @@ COMPILERS = {
         name="taichi",
         title="Taichi",
         prefix="TI",
+        cache=".cache/taichi/ticache",
         lock="ticache.lock",
         tested_version="1.7.4",
         python_versions="Python 3.10 to 3.13",
@@ -145,6 +145,7 @@ COMPILERS = {
         name="quadrants",
         title="Quadrants",
         prefix="QD",
+        cache=".cache/quadrants/qdcache",
         lock="kernel_compilation_manager/qdcache.lock",
         tested_version="1.4.0",
         python_versions="Python 3.12 to 3.14",

@@ -288,8 +288,13 @@ class KernelConfig:
 
     @property
     def point_fields(self) -> Places:
-        """The first fields, followed by those of the terms; x, y and z at rest [m] of a curved sheet."""
-        return Places(mobility=int(self.by_point), area_share=int(self.by_point), rest=3 * self.curved)
+        """The first fields, followed by those of the terms; x, y and z at rest [m] of a curved sheet.
+
+        The area of a point follows from its mobility where masses are proportional to areas.
+        """
+        return Places(
+            mobility=int(self.by_point), area_share=int(self.by_point and not self.by_area), rest=3 * self.curved
+        )
 
     @property
     def memory_fields(self) -> list[int]:

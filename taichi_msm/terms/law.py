@@ -94,6 +94,16 @@ def build_law(law: Law, operations: Operations) -> LawFunctions:
     return LawFunctions(ratio, operations.wrap(secant), tangent, by_shape, operations.wrap(formulas.integral))
 
 
+def build_pull_of_squares(operations: Operations) -> Callable[..., Any]:
+    """Build pull(k, square_difference, square, square_at_rest) of a linear spring: one square root, of L^2 L0^2."""
+    sqrt = operations.sqrt
+
+    def pull(k, square_difference, square, square_at_rest):
+        return k * square_difference / (square + sqrt(square * square_at_rest))
+
+    return operations.wrap(pull)
+
+
 def build_spring(law: Law | None, operations: Operations, *, tense: bool = True) -> SpringFunctions:
     """Build the functions of a spring; a spring that is not `tense` ignores tau."""
     sqrt, maximum, hold = operations.sqrt, operations.maximum, operations.hold

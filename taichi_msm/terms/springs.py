@@ -37,7 +37,7 @@ from taichi_msm.model.sheet import Material, Springs, largest_mean, spacing
 from taichi_msm.scene.scene import Scene
 from taichi_msm.scene.sheet import Sheet
 from taichi_msm.terms.base import BY_COLUMN, DX, DY, KernelConfig, RowPair, Term
-from taichi_msm.terms.law import build_spring, law_places
+from taichi_msm.terms.law import build_pull_of_squares, build_spring, law_places
 from taichi_msm.terms.places import Places
 from taichi_msm.terms.points import build_point_functions
 
@@ -277,10 +277,11 @@ class SpringTerm(Term):
         beyond an edge.
         """
         ti, vector, tense, curved = config.ti, config.vector, self.tense, config.curved
-        open_edges, tense_edges = self.open_edges, self.tense_edges
+        open_edges, tense_edges, linear = self.open_edges, self.tense_edges, self.law is None
         stiffness_of, tension_of = self.build_stiffness(config), self._build_tension(config)
         numbers_of, rest_position = self._build_numbers(config), build_point_functions(config).rest_position
         pull = build_spring(self.law, config.operations, tense=tense).pull
+        pull_of_squares = build_pull_of_squares(config.operations)
 
         @ti.func
         def masked(k, exists):
@@ -294,13 +295,19 @@ class SpringTerm(Term):
 
         @ti.func
         def force(
-            sheet: ti.template(), family: ti.template(), falls, i, kind, b, exists, square_difference, square, length,
+            sheet: ti.template(), family: ti.template(), falls, i, kind, b, exists, square_difference, square, at_rest,
             edge: ti.template(), q: ti.template(),
         ):  # fmt: skip
-            """Return the force of the spring `edge`, the vector to the mass point that exerts it."""
-            k = masked(stiffness_of(sheet, family, falls, i, kind, b), exists)
+            """Return the force of the spring `edge`, the vector to the mass point that exerts it.
+
+            `at_rest` is its length at rest, squared for a linear spring of a curved sheet.
+            """
+            k, per_length = masked(stiffness_of(sheet, family, falls, i, kind, b), exists), vector(0)
             tension = tension_of(sheet, family, falls, i, kind, b, exists)
-            per_length = pull(k, tension, square_difference, square, length, numbers_of(sheet, family, length))
+            if ti.static(curved and linear):
+                per_length = pull_of_squares(k, square_difference, square, at_rest)
+            else:
+                per_length = pull(k, tension, square_difference, square, at_rest, numbers_of(sheet, family, at_rest))
             total = [per_length * edge[c] for c in ti.static(range(3))]
             if ti.static(tense):
                 for c in ti.static(range(3)):
@@ -313,17 +320,13 @@ class SpringTerm(Term):
         ):
             """Return the force of a spring with the vector o at rest to the mass point that exerts it."""
             edge = [q[c] + o[c] for c in ti.static(range(3))]
-            square_difference, square, square_at_rest = (
-                vector(0),
-                vector(MIN_SQUARED_LENGTH),
-                vector(MIN_SQUARED_LENGTH),
-            )
-            for c in ti.static(range(3)):
-                square_difference += q[c] * (edge[c] + o[c])
-                square += edge[c] * edge[c]
-                square_at_rest += o[c] * o[c]
-            length = ti.sqrt(square_at_rest)
-            return force(sheet, family, falls, i, kind, b, exists, square_difference, square, length, edge, q)
+            square_difference = q[0] * (edge[0] + o[0]) + (q[1] * (edge[1] + o[1]) + q[2] * (edge[2] + o[2]))
+            square = edge[0] * edge[0] + edge[1] * edge[1] + (edge[2] * edge[2] + MIN_SQUARED_LENGTH)
+            square_at_rest = o[0] * o[0] + o[1] * o[1] + (o[2] * o[2] + MIN_SQUARED_LENGTH)
+            at_rest = square_at_rest
+            if ti.static(not linear):
+                at_rest = ti.sqrt(square_at_rest)
+            return force(sheet, family, falls, i, kind, b, exists, square_difference, square, at_rest, edge, q)
 
         @ti.func
         def force_on_right(sheet: ti.template(), pair: ti.template(), entry, b, u: ti.template(), exists):

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from operator import attrgetter
+from functools import reduce
 from typing import Any
 
 from taichi_msm.scene.scene import Scene
@@ -26,15 +26,12 @@ MAX_FACTOR = 10.0
 
 def material_values(scene: Scene) -> dict[str, float]:
     """Return the values of a scene that a session can change, by key of `MATERIAL`."""
-    values = {}
-    for key in MATERIAL:
-        try:
-            value = attrgetter(key)(scene)
-        except AttributeError:
-            continue
-        if isinstance(value, (int, float)) and value > 0:
-            values[key] = float(value)
-    return values
+    values = {key: reduce(_attribute, key.split("."), scene) for key in MATERIAL}
+    return {key: float(value) for key, value in values.items() if isinstance(value, (int, float)) and value > 0}
+
+
+def _attribute(section: Any, name: str) -> Any:
+    return getattr(section, name, None)
 
 
 def with_value(section: Any, key: str, value: float) -> Any:

@@ -75,9 +75,8 @@ def mark_tool(picture: Picture, pixel: tuple[float, float], *, pulls: bool) -> N
     x, y = pixel[0] - left, pixel[1] - top
     colour = (255, 214, 90) if pulls else (255, 255, 255)
     for ring_radius, outline, line_width in ((radius + 1, (0, 0, 0), 3), (radius, colour, 1)):
-        ImageDraw.Draw(image).ellipse(
-            (x - ring_radius, y - ring_radius, x + ring_radius, y + ring_radius), outline=outline, width=line_width
-        )
+        box = x - ring_radius, y - ring_radius, x + ring_radius, y + ring_radius
+        ImageDraw.Draw(image).ellipse(box, outline=outline, width=line_width)
     region[:] = np.asarray(image)
 
 

@@ -11,7 +11,7 @@ from pydantic import Field, field_validator, model_validator
 
 from taichi_msm.errors import FilesError, Problem, SceneError, writing
 from taichi_msm.load.check import parse_model
-from taichi_msm.load.scene_file import Draft, FileKind, read_file
+from taichi_msm.load.scene_file import Draft, read_file
 from taichi_msm.scene.section import MAX_PIXELS, NotNegative, Number, Pixels, Section, key, scene_fault
 from taichi_msm.view.events import KEYS, Drag, Event, Key, Press, Release, Strength, Turn
 from taichi_msm.view.recording import Film
@@ -37,21 +37,17 @@ SCRIPT_KEYS = tuple(name for name in KEYS if name != "q")
 class ScriptEvent(Section):
     """An event of a script."""
 
-    t: Seconds = key(..., description="time of the event, or of its beginning [s]", expects=SECONDS)
+    t: Seconds = key(..., "time of the event, or of its beginning [s]", SECONDS)
     do: Literal["press", "pull", "drag", "release", "turn", "percent", "key"] = key(
-        ..., description="action", expects="press, pull, drag, release, turn, percent or key"
+        ..., "action", "press, pull, drag, release, turn, percent or key"
     )
-    at: Pair | None = key(
-        None, description="pixel of the event", expects="for press, pull and drag [x, y] in pixels from the top left"
-    )
-    by: Pair | None = key(None, description="turn of the picture", expects="for turn [right, down] in pixels")
+    at: Pair | None = key(None, "pixel of the event", "for press, pull and drag [x, y] in pixels from the top left")
+    by: Pair | None = key(None, "turn of the picture", "for turn [right, down] in pixels")
     to: Annotated[Number, Field(ge=-100, le=100)] | None = key(
-        None,
-        description="strength [% of the full force or depth]",
-        expects="for percent a number from -100 to 100",
+        None, "strength [% of the full force or depth]", "for percent a number from -100 to 100"
     )
-    name: str | None = key(None, description="a key of the page", expects="for key the name of one")
-    seconds: Seconds = key(0.0, description="duration [s]", expects=SECONDS)
+    name: str | None = key(None, "a key of the page", "for key the name of one")
+    seconds: Seconds = key(0.0, "duration [s]", SECONDS)
 
     @model_validator(mode="after")
     def _complete(self) -> ScriptEvent:
@@ -72,12 +68,10 @@ class Script(Section):
 
     size: tuple[Pixels, Pixels] | None = key(
         None,
-        description="size of the picture to which pixels refer, width and height [px]; default: the session's",
-        expects=f"two whole numbers, 1 to {MAX_PIXELS}: [width, height] in pixels",
+        "size of the picture to which pixels refer, width and height [px]; default: the session's",
+        f"two whole numbers, 1 to {MAX_PIXELS}: [width, height] in pixels",
     )
-    events: tuple[ScriptEvent, ...] = key(
-        ..., description="actions, in order", expects="a list of mappings with t and do"
-    )
+    events: tuple[ScriptEvent, ...] = key(..., "actions, in order", "a list of mappings with t and do")
 
     @field_validator("events", mode="after")
     @classmethod
@@ -95,7 +89,7 @@ class Script(Section):
 
 def load_script(path: str | Path, size: tuple[int, int]) -> Script:
     """Read and check a script for a picture of a width and height [px], in which all presses must be."""
-    draft = Draft(read_file(str(path), FileKind("script", "events")))
+    draft = Draft(read_file(str(path), "script", "events"))
     script, problems = parse_model(Script, draft.data)
     draft.report(problems)
     draft.report(_outside(script, script.size or size) if script is not None else ())

@@ -169,6 +169,13 @@ class Session(AbstractContextManager["Session"]):
 
     def handle(self, event: events.Event) -> None:
         """Process an event, with effect from the next frame on; raise a FilesError if a file cannot be saved."""
+        try:
+            self._process(event)
+        except (SceneError, DivergedError) as error:
+            self.show_notice(str(error))
+
+    def _process(self, event: events.Event) -> None:
+        """Process an event; a SceneError or DivergedError is the reason why it has no effect."""
         match event:
             case events.Hover(x, y):
                 self._hover_pixel = x, y
@@ -312,8 +319,7 @@ class Session(AbstractContextManager["Session"]):
         """
         position = self._simulation.pick((x, y), self.viewport.view)
         if position is None:
-            self.show_notice(f"no tissue at pixel {x:g}, {y:g}")
-            return
+            raise SceneError([f"no tissue at pixel {x:g}, {y:g}"])
         if isinstance(self.tool, PositionControlledTool):
             position = self._rest_position(x, y) or self.tool.target
         self.tool.press(position, direction)
@@ -383,7 +389,7 @@ class Session(AbstractContextManager["Session"]):
                 else:
                     self._end_film()
             case "w" if self._material_changed:
-                self.show_notice("a scene cannot contain a changed material: reset (r) and repeat the session")
+                raise SceneError(["a scene cannot contain a changed material: reset (r) and repeat the session"])
             case "w":
                 self.show_notice(f"saved {self._captures.save_scene(self.recorded_scene())}")
             case "i":
@@ -405,13 +411,8 @@ class Session(AbstractContextManager["Session"]):
         tool = self._position_tool if by_force else self._force_tool
         if tool is None:
             needs = "position needs an instrument" if by_force else "force needs a force"
-            self.show_notice(f"control by {needs}; add it to a probe of the scene")
-            return
-        try:
-            plan = self._with_tool(tool)
-        except SceneError as error:
-            self.show_notice(error.lines[0])
-            return
+            raise SceneError([f"control by {needs}; add it to a probe of the scene"])
+        plan = self._with_tool(tool)
         self.tool.reset()
         self._forget_pointer()
         self._simulation.restart(plan)
@@ -425,21 +426,14 @@ class Session(AbstractContextManager["Session"]):
     def _change_material(self, key: str, value: float) -> None:
         """Change a value of the material; later resets keep it."""
         if (initial := self._scene_material.get(key)) is None:
-            self.show_notice(f"{key}: missing or 0 in this scene")
-            return
+            raise SceneError([f"{key}: missing or 0 in this scene"])
         # The margin allows for rounding.
         if not initial / MAX_FACTOR * 0.999 <= value <= initial * MAX_FACTOR * 1.001:
-            self.show_notice(f"{key}: {value:g} is not from {initial / MAX_FACTOR:g} to {initial * MAX_FACTOR:g}")
-            return
+            raise SceneError([f"{key}: {value:g} is not from {initial / MAX_FACTOR:g} to {initial * MAX_FACTOR:g}"])
         if self.divergence_error:
-            self.show_notice("the simulation diverged: reset it (r) first")
-            return
-        try:
-            plan = check_scene(with_value(self._plan.scene, key, value), self._plan.maps)
-            self._simulation.change_material(plan)
-        except (SceneError, DivergedError) as error:
-            self.show_notice(str(error))
-            return
+            raise SceneError(["the simulation diverged: reset it (r) first"])
+        plan = check_scene(with_value(self._plan.scene, key, value), self._plan.maps)
+        self._simulation.change_material(plan)
         self._plan, self._material_changed = plan, True
         self.scene = with_value(self.scene, key, value)
         if self._position_tool is not None:

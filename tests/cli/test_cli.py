@@ -10,6 +10,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable
+from contextlib import closing
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -196,6 +197,14 @@ def test_interrupted_command_without_results(command: str, small: Path, message:
     message(error, "interrupted")
 
 
+def test_second_signal_ends_the_process(message: Messages) -> None:
+    listening = "import signal; from taichi_msm.system.process import Interruption; Interruption().listen()"
+    program = f"{listening}; signal.raise_signal(signal.SIGTERM); signal.raise_signal(signal.SIGINT)"
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=False)
+    assert done.returncode == 128 + signal.SIGINT
+    message(done.stderr, "twice")
+
+
 def test_ignored_signals_stay_ignored() -> None:
     """A shell's background ignores SIGINT, and nohup SIGHUP."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
@@ -278,7 +287,7 @@ def test_remaining_time_within_a_frame(
 ) -> None:
     now = 0.0
     monkeypatch.setattr(time, "monotonic", lambda: now)
-    with console.ProgressDisplay(quiet=False) as progress, console.ProgressDisplay(quiet=True) as silent:
+    with closing(console.ProgressDisplay(False)) as progress, closing(console.ProgressDisplay(True)) as silent:
         for now, frame in ((0, 1), (11, 1), (50, 2), (51, 2), (61, 2), (250, 2)):  # noqa: B007
             progress.update("frames", frame, 4)
             silent.update("frames", frame, 4)

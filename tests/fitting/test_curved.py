@@ -45,7 +45,7 @@ def scene(surface: Any, young: float = 2e4, **keys: Any) -> Scene:
 
 def observations(truth: Scene, kind: str, device: Device) -> NDArray[np.float64]:
     """Positions [m] or pixels of PLACES in every frame."""
-    values = []
+    values: list[NDArray[Any]] = []
     with Simulation(truth, threads=device.threads) as simulation:
         for frame in range(len(TIME)):
             simulation.advance(min(frame, 1))

@@ -19,7 +19,7 @@ from taichi_msm.fitting.machine_curve import CurveRuns, relax
 from taichi_msm.fitting.machine_fit import FittedTest, explanations, fitted_tests, unknown_notes
 from taichi_msm.fitting.machine_model import MachineForces, MachineProblem, read_machine_problem
 from taichi_msm.fitting.observation import ErrorCorrelation
-from taichi_msm.fitting.parameters import Parameter
+from taichi_msm.fitting.parameters import Parameter, Request
 from taichi_msm.fitting.predict import Prediction
 from taichi_msm.fitting.profiles import Profiler
 from taichi_msm.fitting.uncertainty import uncertainty
@@ -158,7 +158,7 @@ def test_recovery_of_a_clamped_strip(device: Device, tmp_path: Path) -> None:
 
 def test_a_contact_at_the_greatest_depth_has_no_curve(pressed: str, message: Messages) -> None:
     """As in a profile, which extends to the bounds."""
-    problem = read_machine_problem([pressed], scene(), ["contact"], {}, None, {"contact": [CONTACT]})
+    problem = read_machine_problem([pressed], Request(scene(), ["contact"], {}, None, {"contact": [CONTACT]}))
     with CurveRuns(problem, 1, lambda stage, done, total: None) as runs:
         assert runs.predict_coarse(problem.limits[1], 0) is None
         with message.raises(SceneError, "contact"):
@@ -170,7 +170,7 @@ def test_starts_are_within_bounds(pressed: str) -> None:
     start = scene(relaxation=[{"share": 0.8, "time": 0.6}, {"share": 0.1, "time": 5.0}])
     free = [SHARE, SHARE.replace("0", "1"), TIME]
     bounds = {SHARE: (0.7, 0.9), SHARE.replace("0", "1"): (1e-14, 0.9)}
-    problem = read_machine_problem([pressed], start, free, bounds, None, {"contact": [CONTACT]})
+    problem = read_machine_problem([pressed], Request(start, free, bounds, None, {"contact": [CONTACT]}))
     low, high = problem.limits
     with CurveRuns(problem, 1, lambda stage, done, total: None) as runs:
         assert runs.with_valid_shares(np.zeros(3)).tolist() == [0, 0, 0]

@@ -426,12 +426,3 @@ def test_interrupt_during_a_linear_solution(device: Device, monkeypatch: pytest.
     monkeypatch.setattr(rest, "_solve", lambda *_: time.sleep(2))
     with pytest.raises(KeyboardInterrupt):
         adjoint.backward(slope, Mock(side_effect=[None, None, KeyboardInterrupt]))
-
-
-def test_invalid_factors_are_rejected(image: str, device: Device, message: Messages) -> None:
-    adjoint = adjoint_of(moving("tissue", image), device)
-    with message.raises(MsmError, "run"):
-        adjoint.backward(np.zeros((3, 6, 11, 3)))
-    for factors in (np.ones((6, 11)), np.zeros((5, 10)), np.full((5, 10), 1000.0)):
-        with message.raises(ArgumentError, "factors: "):
-            adjoint.run(factors)

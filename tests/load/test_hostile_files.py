@@ -15,10 +15,12 @@ from pathlib import Path
 
 import pytest
 
+from taichi_msm.array_files import read_array_file
 from taichi_msm.camera_files.camera_file import CameraFileError
 from taichi_msm.camera_files.readers import PoseKeys, read_calibration, read_poses
 from taichi_msm.errors import MsmError
 from taichi_msm.fitting.archive import read_observations
+from taichi_msm.images import PictureError
 from taichi_msm.load.scene_file import load_scene, parse_override
 from taichi_msm.sweeps.spec import load_sweep
 
@@ -47,6 +49,10 @@ READERS: dict[str, tuple[Callable[[Path], object], tuple[str, ...]]] = {
     "scene": (load_scene, ("", "image: ", "sheet: {points: ")),
     "override": (lambda path: parse_override(path.read_text()), ("", "image=")),
     "sweep": (load_sweep, ("", "scene: s.yaml\nvary: {image: {choice: '", "scene: s.yaml\nvariables: {")),
+    "array": (
+        lambda path: read_array_file(str(path), 1.0, ("points",), lambda shape: len(shape) == 3, "(r, c, 3)"),
+        ("", "PK\x03\x04", "\x93NUMPY\x01\x00v\x00{", "\x93NUMPY\x02\x00\x00\x00\x02\x00{'shape': ("),
+    ),
     "points": (lambda path: read_observations(path, 25.0), ("", "PK\x03\x04", "PK\x05\x06")),
 }
 
@@ -67,9 +73,9 @@ def read_all(folder: Path) -> None:
         sys.stdout.write(f"{reader} {text[:100]!r}\n")
         sys.stdout.flush()
         path = folder / "hostile"
-        path.write_text(text, newline="")
+        path.write_bytes(text.encode("latin-1"))
         signal.setitimer(signal.ITIMER_PROF, LIMIT_S)
-        with suppress(CameraFileError, MsmError):
+        with suppress(CameraFileError, MsmError, PictureError):
             READERS[reader][0](path)
     signal.setitimer(signal.ITIMER_PROF, 0)
 

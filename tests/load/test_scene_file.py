@@ -9,13 +9,16 @@ from pathlib import Path
 from typing import Any
 
 import jsonschema
+import numpy as np
 import pytest
 from PIL import Image
 
 from taichi_msm.errors import SceneError, printable
 from taichi_msm.load.check import parse_model
 from taichi_msm.load.scene_file import MAX_LINES, load_scene, parse_override, schema
+from taichi_msm.model.rest import rest_of
 from taichi_msm.scene.scene import Scene
+from taichi_msm.scene.sheet import Sheet
 from tests.golden import Messages
 from tests.scenes import random_contact, random_scene, random_tissue
 
@@ -450,3 +453,21 @@ def test_schema_rejects_invalid_scenes(validator: jsonschema.Draft202012Validato
         assert not validator.is_valid(good | invalid), invalid
     for key in ("sheet", "springs", "time"):
         assert not validator.is_valid({name: value for name, value in good.items() if name != key})
+
+
+def test_surface_whose_file_was_read_stays_valid(root: Path) -> None:
+    # Sections that hold it validate it again.
+    sheet = load_scene(root / "scenes" / "kidney.yaml").sheet
+    assert sheet.surface is not None
+    assert sheet.surface.file is not None
+    assert Sheet(points=(2, 2), size=(1, 1), surface=sheet.surface).surface is sheet.surface
+
+
+def test_changed_file_of_a_surface_is_read_again(tmp_path: Path) -> None:
+    def heights() -> float:
+        sheet = Sheet(points=(5, 5), size=(1, 1), surface={"height": {"file": str(tmp_path / "z.npy"), "unit": "mm"}})
+        return float(rest_of(sheet).position[..., 2].max())
+
+    for value in (1.0, 2.0, 2.0):
+        np.save(tmp_path / "z.npy", np.full((3, 3), value))
+        assert heights() == pytest.approx(value / 1000)

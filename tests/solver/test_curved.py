@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from taichi_msm.model.cells import Cells, isotropy_errors
 from taichi_msm.model.rest import CurvedRest, rest_of
+from taichi_msm.model.tools import solid_tools
 from taichi_msm.scene.scene import Scene
 from taichi_msm.solver.arrays import SheetLayout
 from taichi_msm.solver.dynamics import Dynamics
@@ -21,6 +24,7 @@ from taichi_msm.terms import highest_frequency
 from taichi_msm.terms.contact_rest import touched_points
 from taichi_msm.terms.springs import assemble_springs
 from tests import reference
+from tests.reference import surface
 from tests.reference.contact import centre
 from tests.reference.loads import frame_loads
 from tests.reference.sheet import highest_frequency as twin_frequency
@@ -148,7 +152,32 @@ def test_material_matches_twin(case: str) -> None:
     assert frequency == pytest.approx(twin_frequency(scene), rel=1e-12)
 
 
+def test_isotropy_errors_match_twin() -> None:
+    rng, (i, j) = np.random.default_rng(1), np.mgrid[:12, :9]
+    noise = rng.random((3, *i.shape))
+    position = np.stack([j + 0.3 * noise[0], -0.8 * i - 0.2 * noise[1], 0.3 * noise[2]], axis=-1)
+    expected = surface.isotropy_error(surface.cells(position))
+    assert expected.max() > 0.3
+    np.testing.assert_allclose(isotropy_errors(Cells.of(position)), expected, rtol=0, atol=1e-13)
+
+
 def test_motion_in_f32(device: Device) -> None:
     """A load and a ball that move along a tube: positions are rounded at 1e-7 of the sheet, 4e-6 of a displacement."""
     single, double = (frames(scene_of("tube, friction", precision=precision), device) for precision in ("f32", "f64"))
     np.testing.assert_allclose(single, double, rtol=0, atol=1e-4 * np.abs(double).max())
+
+
+def test_spacing_is_that_under_the_path(tmp_path: Path) -> None:
+    """The columns under the ball are 1 mm apart, those at the far side 1.5 mm."""
+    x = np.cumsum([0.0] + [0.001] * 12 + [0.0015] * 6)
+    np.save(tmp_path / "grid.npy", np.stack(np.broadcast_arrays(x, -0.001 * np.arange(9)[:, None], 0.0), axis=-1))
+    path = [[0, 0.2, 0.5, 0.001], [1, 0.4, 0.5, 0.001]]
+    scene = scene_of("tube, loads").model_copy(
+        update={
+            "sheet": {"surface": {"points": {"file": str(tmp_path / "grid.npy"), "unit": "m"}}},
+            "probes": [{**BALL, "path": path}],
+        }
+    )
+    (tool,) = solid_tools(make_plan(scene).tools).values()
+    assert tool.point_spacing(scene.sheet) == pytest.approx(0.001)
+    assert rest_of(scene.sheet).longest_side == pytest.approx(0.0015)

@@ -20,6 +20,7 @@ from pathlib import Path
 from typing import Any
 from unittest.mock import Mock
 
+import numpy as np
 import pytest
 from PIL import Image
 
@@ -315,6 +316,26 @@ def test_invalid_shards(many: Path, program: Program, message: Messages) -> None
         done = program("sweep", "many.yaml", "--shard", part)
         assert done.returncode == 2
         message(done.stderr, part)
+
+
+def test_surfaces_vary(small: Path, pool: Pool) -> None:
+    """A radius that is too small is a refused run; files are a choice, by a pattern, with digests in the records."""
+    (small / "tube.yaml").write_text(SMALL.replace("mass:", "surface: {tube: {radius: 1}}, mass:"))
+    (small / "wall.yaml").write_text(SMALL.replace("size: [0.3, 0.4]", "surface: {points: {file: 0.npy, unit: mm}}"))
+    across, down = np.meshgrid(np.linspace(0, 400, 11), np.linspace(0, 300, 9))
+    for number in range(2):
+        np.save(f"{number}.npy", np.stack([across, -down, number * across**2 / 1000], axis=-1))
+
+    def sweep_over(kind: str, key: str, values: list[float] | str) -> list[Outcome]:
+        vary = {f"sheet.surface.{key}": {"choice": values}}
+        return list(sweep(f"{kind}.yaml", vary, kind, samples=2, overrides={"output": []}, executor=pool))
+
+    rows = sorted(sweep_over("tube", "tube.radius", [0.05, 0.1]), key=lambda row: row.status)
+    assert [row.status for row in rows] == ["complete", "refused"]
+    assert "take at least 0.06369 m" in str(rows[1].error)
+    assert [row.status for row in sweep_over("wall", "points.file", "?.npy")] == ["complete"] * 2
+    digests = {json.loads(path.read_text())["surface"]["sha256"] for path in Path("wall/runs").glob("*/run.json")}
+    assert digests == {hashlib.sha256(Path(f"{number}.npy").read_bytes()).hexdigest() for number in range(2)}
 
 
 @pytest.mark.slow

@@ -128,8 +128,8 @@ def test_drag_follows_the_surface(surface: dict[str, Any], begin: Begin) -> None
     session.handle(Press(*pixel_of(session, 8, 3)))
     drag = Drag(*pixel_of(session, 6, 12))
     advance(session, 10)
-    sequences: list[list[Event]] = [[drag], [Turn(6, 4), drag, Turn(-6, 2)], [Drag(-500, 0)]]
-    for events in sequences:
+    turns: list[Event] = [Turn(6, 4), drag, Turn(-6, 2)]
+    for events in ([drag], turns, [Drag(-500, 0)]):
         for event in events:
             session.handle(event)
         session.advance()

@@ -36,7 +36,7 @@ from taichi_msm.view.events import (
 from taichi_msm.view.recording import Captures
 from taichi_msm.view.script import record_film
 from taichi_msm.view.session import Session, divide_frames
-from taichi_msm.view.tools import PositionControlledTool
+from taichi_msm.view.tools import ForceControlledTool, PositionControlledTool
 from tests.golden import Messages
 from tests.outputs import duration
 from tests.scenes import plan_of
@@ -224,6 +224,7 @@ def test_reset(begin: Begin) -> None:
     session.handle(Drag(70, 50))
     assert session.tool.target == (0.5, 0.5)
     assert (displacement(session) < AT_REST).all()
+    assert isinstance(session.tool, ForceControlledTool)
     assert (session.frame, session.tool.percent) == (0, 0)
     session.handle(Press(60, 50))
     np.testing.assert_array_equal(advance(session, 5), first)
