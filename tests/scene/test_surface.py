@@ -272,6 +272,19 @@ def test_a_note_about_sharp_folds(write: Callable[..., Path], message: Messages)
     message(surface_notes(load_scene(write("{height: {file: z.npy, unit: m}}"))), "degrees")
 
 
+def test_force_on_a_fold(message: Messages) -> None:
+    """A fold has more area around the control point than a plane, over which the force is spread."""
+    tube = {"radius": 0.025, "folds": {"depth": 0.012, "spacing": 0.02}}
+    made = scene(
+        sheet={"points": [41, 41], "size": [0.06, 0.06], "surface": {"tube": tube}},
+        tissue=TISSUE,
+        springs=None,
+        damping=0,
+        probes=[{"total": -1, "radius": 0.01, "falloff": 300}],
+    )
+    message(force_warnings(made, probe_records(made)), "probes.0")
+
+
 def test_a_picture_in_few_steps(write: Callable[..., Path]) -> None:
     """Grey values of 8 bits in a picture of 16 bits: a step is 1 / 255 of the range."""
     grey = np.linspace(0, 255, 80).astype(np.uint8)[None].repeat(9, axis=0)
