@@ -20,6 +20,7 @@ from taichi_msm.accuracy.surface import describe_surface, surface_notes, surface
 from taichi_msm.errors import SceneError
 from taichi_msm.load.cost import estimate_budget
 from taichi_msm.load.scene_file import load_plan, load_scene, schema
+from taichi_msm.model.tool_force import force_warnings, probe_records
 from taichi_msm.scene.scene import Scene
 from taichi_msm.scene.sheet import Sheet
 from tests.golden import Messages
@@ -275,12 +276,12 @@ def test_a_note_about_sharp_folds(write: Callable[..., Path], message: Messages)
 def test_force_on_a_fold(message: Messages) -> None:
     """A fold has more area around the control point than a plane, over which the force is spread."""
     tube = {"radius": 0.025, "folds": {"depth": 0.012, "spacing": 0.02}}
-    made = scene(
+    made = Scene(
+        output=[],
         sheet={"points": [41, 41], "size": [0.06, 0.06], "surface": {"tube": tube}},
-        tissue=TISSUE,
-        springs=None,
-        damping=0,
+        tissue={"young": 2e4, "thickness": 0.002, "density": 1000},
         probes=[{"total": -1, "radius": 0.01, "falloff": 300}],
+        time={"duration": 1, "frames_per_second": 1},
     )
     message(force_warnings(made, probe_records(made)), "probes.0")
 
