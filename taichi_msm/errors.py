@@ -132,8 +132,8 @@ def did_you_mean(name: str, known: Iterable[str]) -> str:
     # Imported here, as only a message needs it.
     from difflib import get_close_matches
 
-    # Matching takes time in proportion to the length of the name.
-    matches = get_close_matches(name[:60].lower(), list(known), n=1)
+    # Matching takes time in proportion to the length of the name; a single letter is similar to none.
+    matches = get_close_matches(name[:60].lower(), [each for each in known if len(each) > 1], n=1)
     return f"; did you mean '{matches[0]}'?" if matches and matches[0] != name else ""
 
 

@@ -37,21 +37,24 @@ def surface_problems(scene: Scene) -> Iterator[Problem]:
         yield Problem(("sheet", "surface", *surface.file_key), str(error))
         return
     assert isinstance(rest, CurvedRest)
-    if (fault := _fold(rest)) or (scene.tissue is not None and (fault := _anisotropy(rest, surface.kind))):
+    if (fault := _fold(rest, scene)) or (scene.tissue is not None and (fault := _anisotropy(rest, surface.kind))):
         yield Problem(key, fault)
     if scene.tissue is not None and scene.tissue.bending:
         text = "needs a flat sheet; with sheet.surface take pretension or foundation instead, which also limit folds"
         yield Problem(("tissue", "bending"), text)
 
 
-def _fold(rest: CurvedRest) -> str:
+def _fold(rest: CurvedRest, scene: Scene) -> str:
     """Return the fault of a cell without area, or turned over relative to a neighbour; empty without one."""
     normals, cells = rest.cell_normals, rest.cells
     has_area = cells.area > MIN_SINE * cells.side_a * cells.side_b
     if not has_area.all():
         return f"the cell at {describe_largest(~has_area)} has no area; its corners must not be on a line"
     if (angle := neighbour_angles(normals)).max(initial=0.0) > 90:
-        return f"{describe_fold(angle)}, more than 90; {FOLD_REMEDY}"
+        rise, remedy = float(np.ptp(rest.position[..., 2])), FOLD_REMEDY
+        if scene.sheet.surface and scene.sheet.surface.height and rise > max(scene.sheet.size):
+            remedy = f"heights are in metres, and rise by {rise:.3g} m"
+        return f"{describe_fold(angle)}, more than 90; {remedy}"
     return ""
 
 

@@ -129,7 +129,10 @@ def _stretched_picture(scene: Scene) -> Iterator[str]:
     sheet_height, sheet_width = scene.sheet.size
     if _nearly_equal(sheet_width * height, sheet_height * width):
         return
-    side = max(sheet_height, sheet_width) / max(height, width)
+    side, surface = max(sheet_height, sheet_width) / max(height, width), scene.sheet.surface
+    # A side of a tube or dome may be at its limit already, so the other one becomes shorter.
+    if surface and (surface.tube or surface.dome):
+        side = min(sheet_height / height, sheet_width / width)
     settings = f'--set "sheet.size=[{height * side:.4g},{width * side:.4g}]"'
     if scene.tissue is not None:
         # Tissue requires cells that are nearly square.

@@ -17,7 +17,7 @@ METRES = {"m": 1.0, "mm": 1e-3, "um": 1e-6}
 
 Radius = Annotated[Number, Field(ge=-MAX_MAGNITUDE, le=MAX_MAGNITUDE)]
 Unit = Literal["m", "mm", "um"] | Positive
-_UNIT_EXPECTS = "m, mm, um, or a number above 0, in metres per count"
+_UNIT_EXPECTS = "m, mm, um, or a number above 0, in metres per count, such as 0.01 for cm"
 
 
 class HeightField(Section):

@@ -273,17 +273,26 @@ def test_a_note_about_sharp_folds(write: Callable[..., Path], message: Messages)
     message(surface_notes(load_scene(write("{height: {file: z.npy, unit: m}}"))), "degrees")
 
 
+def scene_with(sheet: Any, **keys: Any) -> Scene:
+    tissue = {"young": 2e4, "thickness": 0.002, "density": 1000}
+    return Scene(output=[], sheet=sheet, tissue=tissue, time={"duration": 1, "frames_per_second": 1}, **keys)
+
+
 def test_force_on_a_fold(message: Messages) -> None:
     """A fold has more area around the control point than a plane, over which the force is spread."""
     tube = {"radius": 0.025, "folds": {"depth": 0.012, "spacing": 0.02}}
-    made = Scene(
-        output=[],
-        sheet={"points": [41, 41], "size": [0.06, 0.06], "surface": {"tube": tube}},
-        tissue={"young": 2e4, "thickness": 0.002, "density": 1000},
-        probes=[{"total": -1, "radius": 0.01, "falloff": 300}],
-        time={"duration": 1, "frames_per_second": 1},
-    )
+    sheet = {"points": [41, 41], "size": [0.06, 0.06], "surface": {"tube": tube}}
+    made = scene_with(sheet, probes=[{"total": -1, "radius": 0.01, "falloff": 300}])
     message(force_warnings(made, probe_records(made)), "probes.0")
+
+
+@pytest.mark.parametrize("unit", [True, False], ids=["of points", "of a radius"])
+def test_implausible_units(unit: bool, tmp_path: Path, message: Messages) -> None:
+    x, y = np.meshgrid(np.linspace(0, 80, 21), np.linspace(60, 0, 16))
+    np.save(tmp_path / "grid.npy", np.stack([x, y, 0.01 * x**2], axis=-1))
+    points = {"surface": {"points": {"file": str(tmp_path / "grid.npy"), "unit": "m"}}}
+    dome = {"points": [21, 21], "size": [0.1, 0.1], "surface": {"dome": {"radius": 60}}}
+    message(surface_notes(scene_with(points if unit else dome)), "sheet.surface")
 
 
 def test_a_picture_in_few_steps(write: Callable[..., Path]) -> None:
