@@ -62,7 +62,7 @@ def cell_stiffness(cells: Cells, membrane: Array | float) -> CellStiffness:
     w = 3 / 16 * membrane / (p * q * (1 - c * c) ** 1.5)
     along_a, along_b = w * (3 * (q / p) ** 2 - 1 - 2 * c * c), w * (3 * (p / q) ** 2 - 1 - 2 * c * c)
     falling, rising = w * (1 - c) * (1 - 2 * c), w * (1 + c) * (1 + 2 * c)
-    is_clamped = (along_a < 0) | (along_b < 0) | (falling < 0) | (rising < 0)
+    is_clamped = np.minimum.reduce((along_a, along_b, falling, rising)) < -1e-9 * w  # Not by rounding.
     along_a, along_b, falling, rising = np.maximum((along_a, along_b, falling, rising), 0)
     return CellStiffness(along_a, along_b, falling, rising, is_clamped)
 

@@ -101,11 +101,11 @@ class Sheet(Section):
         if surface.points:
             # It is not given.
             self.__pydantic_fields_set__.discard("size")
-        if surface.tube and width > 2 * math.pi * abs(surface.tube.radius):
+        if surface.tube and width > 2 * math.pi * abs(surface.tube.radius) * (1 + 1e-9):
             radius = surface.tube.radius
             text = f"{radius:g} m is too small to roll a width of {width:g} m"
             raise scene_fault(f"{text}; {_remedy(radius, width / 2 / math.pi)}", "surface", "tube", "radius")
-        if surface.dome and max(height, width) / 2 > math.pi / 4 * abs(surface.dome.radius):
+        if surface.dome and max(height, width) / 2 > math.pi / 4 * abs(surface.dome.radius) * (1 + 1e-9):
             radius, side = surface.dome.radius, max(height, width)
             text = f"{radius:g} m is too small for a side of {side:g} m"
             raise scene_fault(f"{text}; {_remedy(radius, 2 * side / math.pi)}", "surface", "dome", "radius")

@@ -319,6 +319,24 @@ def test_records(write: Callable[..., Path]) -> None:
     )
 
 
+@pytest.mark.parametrize("down", [(0, 3**0.5), (0, 3**-0.5), (0.5, 0.75**0.5), (-0.5, 0.75**0.5)])
+def test_cells_at_the_limit_are_not_clamped(write: Callable[..., Path], down: tuple[float, float]) -> None:
+    """Rectangles with sides sqrt(3) to 1, and rhombi of 60 and 120 degrees: a number is 0 but for rounding."""
+    i, j = np.mgrid[:9, :11] * 0.01
+    np.save("p.npy", np.stack([j + down[0] * i, -down[1] * i, 0 * i], axis=-1))
+    record = surface_record(load_scene(write("{points: {file: p.npy, unit: m}}")))
+    assert record is not None
+    assert record["clamped"] == 0
+
+
+@pytest.mark.parametrize(
+    "surface", [f"{{tube: {{radius: {0.1 / (2 * np.pi)}}}}}", f"{{dome: {{radius: {0.2 / np.pi}}}}}"]
+)
+def test_the_smallest_radii(write: Callable[..., Path], surface: str) -> None:
+    """A tube whose sides meet and a quarter of a dome are allowed, although a product is larger by rounding."""
+    load_scene(write(surface))
+
+
 def test_schema() -> None:
     """Exactly one kind; surfaces of points need neither size nor number of points."""
     described = schema()
