@@ -238,6 +238,13 @@ def test_steep_heights(write: Callable[..., Path], message: Messages) -> None:
         load_scene("s.yaml", {"sheet.surface.height.unit": 1e3, "sheet.size": [8e-5, 1e-4]})
 
 
+def test_heights_in_another_unit(write: Callable[..., Path], message: Messages) -> None:
+    """Ridges of 300 mm between the columns of a sheet of 100 mm, which would be gentle in micrometres."""
+    np.save("z.npy", np.tile(300 * (np.arange(11) % 2), (9, 1)))
+    with message.raises(SceneError, "s.yaml:5:6: sheet.surface.height: "):
+        load_scene(write("{height: {file: z.npy, unit: mm}}"))
+
+
 def test_a_tube_of_few_points(write: Callable[..., Path], message: Messages) -> None:
     """Three cells around a tube meet at about 120 degrees."""
     with message.raises(SceneError, "degrees"):
