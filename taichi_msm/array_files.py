@@ -1,4 +1,4 @@
-"""Reading arrays of numbers from .npy and .npz files, which may be corrupt or malicious."""
+"""Reader of .npy and .npz files of numbers, which may be corrupt or malicious."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ MEMORY_FACTOR = 4
 
 @dataclass(frozen=True, eq=False)
 class ArrayFile:
-    """Numbers of a file in metres; equal to itself alone, so that sections of scenes that keep it can be compared."""
+    """Numbers of a file in metres, compared by identity, as sections of scenes keep it and arrays have no one ==."""
 
     values: NDArray[Any]  # float64
     sha256: str  # of the file
@@ -41,7 +41,7 @@ class ArrayFile:
 def read_array_file(
     path: str, unit: float, names: Sequence[str], is_shape: Callable[[tuple[int, ...]], bool], shapes: str
 ) -> ArrayFile:
-    """Read the array of an .npy, or one of an .npz by its name or as its only one, and convert it from `unit` [m].
+    """Read an .npy, or of an .npz the first of `names` in it or its only array, and convert it from `unit` [m].
 
     A PictureError reports a file without an array of an allowed shape, `shapes` in words, of finite numbers.
     """
@@ -64,7 +64,7 @@ def read_array_file(
     if not is_shape(array.shape) or 0 in array.shape:
         raise PictureError(f"{path} has an array of shape {array.shape}", remedy)
     values = array.astype(np.float64) * unit
-    # Also NaN is not small.
+    # NaN also fails this comparison.
     is_small = np.abs(values) <= MAX_M
     if not is_small.all():
         at = ", ".join(map(str, np.unravel_index(int((~is_small).argmax()), array.shape)))

@@ -1,4 +1,4 @@
-"""How well the springs of a curved sheet approximate tissue: its record in run.json, notes, and lines of `check`."""
+"""Cells of a curved sheet and their isotropy: record in run.json, notes, and lines of `check`."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ from taichi_msm.terms.elasticity import spring_families
 NOTED_ISOTROPY_ERROR, NOTED_ANGLE_DEGREES, NOTED_STEP = 0.1, 45.0, 1 / 20
 
 
-# Notes warn of a longer sheet, and of one that rises less, relative to its length; probably the unit is wrong.
+# Extent above which, and rise relative to it below which, a wrong unit is likely.
 MAX_EXTENT_M, MIN_RISE = 5.0, 1e-3
 
 
@@ -80,13 +80,12 @@ def surface_notes(scene: Scene) -> Iterator[str]:
             f"sheet.surface: heights in steps of {file.step:.3g} m, over a twentieth of a cell's side, {side:.3g} m; "
             "take a picture of 16 bits, or an array of floating-point numbers"
         )
-    sides = np.sort(np.ptp(rest.position.reshape(-1, 3), axis=0))
-    if surface.points and sides[2] > MAX_EXTENT_M:
-        yield f"sheet.surface.points: {sides[2]:.3g} m is long for tissue; if these are millimetres, take unit: mm"
-    elif not surface.points and sides[0] < MIN_RISE * sides[2]:
-        yield (
-            f"sheet.surface: nearly flat, as it rises by {sides[0]:.2g} m over {sides[2]:.3g} m; lengths are in metres"
-        )
+    extents = np.sort(np.ptp(rest.box, axis=0))
+    if surface.points and extents[2] > MAX_EXTENT_M:
+        yield f"sheet.surface.points: {extents[2]:.3g} m is long for tissue; if these are millimetres, take unit: mm"
+    elif not surface.points and extents[0] < MIN_RISE * extents[2]:
+        rise = f"{extents[0]:.2g} m over {extents[2]:.3g} m"
+        yield f"sheet.surface: nearly flat, as it rises by {rise}; lengths are in metres"
     angles = neighbour_angles(rest.cell_normals)
     if angles.max() > NOTED_ANGLE_DEGREES:
         yield f"sheet.surface: {describe_fold(angles)}; {FOLD_REMEDY}"

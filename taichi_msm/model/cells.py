@@ -1,4 +1,4 @@
-"""The cells of a curved sheet: sides, angles, areas and normals; stiffness of their springs.
+"""Cells of a curved sheet: sides, angles and areas, and the stiffness of their springs.
 
 A cell has the corners X00, X01 (right), X10 (below) and X11, and the mean sides a and b,
 
@@ -50,9 +50,9 @@ class CellStiffness(NamedTuple):
     """Stiffness of the springs of cells divided by their squared lengths, from this cell alone [N/m3]."""
 
     along_a: Array  # each of the two sides along a, shape (rows - 1, cols - 1)
-    along_b: Array
-    falling: Array  # diagonal
-    rising: Array
+    along_b: Array  # each of the two sides along b
+    falling: Array  # diagonal X00-X11
+    rising: Array  # diagonal X01-X10
     is_clamped: NDArray[np.bool_]  # whether any number was negative
 
 
@@ -77,24 +77,14 @@ def isotropy_errors(cells: Cells) -> Array:
     k, p, q, c = cell_stiffness(cells, 1.0), cells.side_a, cells.side_b, cells.cosine
     x, y = q * c, q * np.sqrt(1 - c * c)
     springs = ((2 * k.along_a, p, 0 * y), (2 * k.along_b, x, y), (k.falling, p + x, y), (k.rising, p - x, -y))
-    matrix = np.zeros((3, 3, *c.shape))  # of the ratio of both energies
+    # The quadratic form of the ratio of both energies; each cell has two sides along a and two along b.
+    matrix = np.zeros((*c.shape, 3, 3))
     for stiffness, d_x, d_y in springs:
-        parts = (d_x * d_x + d_y * d_y) / np.sqrt(3), (d_x * d_x - d_y * d_y) / np.sqrt(1.5), d_x * d_y / np.sqrt(0.375)
+        square = d_x * d_x + d_y * d_y
+        parts = square / np.sqrt(3), (d_x * d_x - d_y * d_y) / np.sqrt(1.5), 2 * d_x * d_y / np.sqrt(1.5)
         for i, j in np.ndindex(3, 3):
-            matrix[i, j] += stiffness / cells.area * parts[i] * parts[j]
-    return np.maximum(*(np.abs(value - 1) for value in _extreme_eigenvalues(matrix)))
-
-
-def _extreme_eigenvalues(matrix: Array) -> tuple[Array, Array]:
-    """Return the smallest and the largest eigenvalue of symmetric matrices, shape (3, 3, ...), by Cardano's formula."""
-    mean = np.trace(matrix) / 3
-    deviation = matrix - mean * np.eye(3).reshape(3, 3, *(1,) * mean.ndim)
-    size = np.sqrt((deviation**2).sum(axis=(0, 1)) / 6)
-    (a, b, c), (_, d, e), (_, _, f) = deviation
-    determinant = a * (d * f - e * e) - b * (b * f - c * e) + c * (b * e - c * d)
-    with np.errstate(divide="ignore", invalid="ignore"):
-        angle = np.arccos(np.clip(np.nan_to_num(determinant / size**3 / 2), -1, 1)) / 3
-    return mean + 2 * size * np.cos(angle + 2 * np.pi / 3), mean + 2 * size * np.cos(angle)
+            matrix[..., i, j] += stiffness / cells.area * parts[i] * parts[j]
+    return np.asarray(np.abs(np.linalg.eigvalsh(matrix) - 1).max(axis=-1))
 
 
 def sum_around_points(values: Array) -> Array:

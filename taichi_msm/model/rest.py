@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from taichi_msm.model.cells import Cells, isotropy_errors, sum_around_points, unit
 from taichi_msm.scene.sheet import Sheet
-from taichi_msm.scene.surface import Dome, HeightField, PointGrid, Tube
+from taichi_msm.scene.surface import Dome, HeightField, PointGrid, RestSurface, Tube
 
 Array = NDArray[np.float64]
 
@@ -35,10 +35,10 @@ class Rest(ABC):
     shortest_side: float  # of the sides of all cells [m]
     longest_side: float
 
-    @property
-    @abstractmethod
+    @cached_property
     def box(self) -> Array:
         """Lower and upper corner of the sheet's box [m], shape (2, 3)."""
+        return np.stack([self.position.min(axis=(0, 1)), self.position.max(axis=(0, 1))])
 
     @property
     def sides(self) -> tuple[float, float]:
@@ -63,7 +63,7 @@ class Rest(ABC):
 
     @property
     def is_flat(self) -> bool:
-        """Whether the sheet is a rectangle in the plane z = 0."""
+        """Whether the sheet is a `FlatRest`, a rectangle in the plane z = 0."""
         return isinstance(self, FlatRest)
 
     @abstractmethod
@@ -113,11 +113,6 @@ class FlatRest(Rest):
         dx, dy = width / (cols - 1), height / (rows - 1)
         self.cell_area, self.cell_sides = dx * dy, (dx, dy)
         self.shortest_side, self.longest_side = min(dx, dy), max(dx, dy)
-
-    @property
-    def box(self) -> Array:
-        height, width = self._size
-        return np.array([[-width / 2, -height / 2, 0.0], [width / 2, height / 2, 0.0]])
 
     @property
     def sides(self) -> tuple[float, float]:
@@ -171,10 +166,6 @@ class CurvedRest(Rest):
         sides = np.concatenate([np.linalg.norm(np.diff(position, axis=n), axis=-1).ravel() for n in (0, 1)])
         self.shortest_side, self.longest_side = float(sides.min()), float(sides.max())
 
-    @cached_property
-    def box(self) -> Array:
-        return np.stack([self.position.min(axis=(0, 1)), self.position.max(axis=(0, 1))])
-
     @property
     def outline(self) -> Array:
         return self.position.reshape(-1, 3)
@@ -209,8 +200,7 @@ class CurvedRest(Rest):
         return self._interpolate(self.position, coordinates)
 
     def normals(self, coordinates: Array) -> Array:
-        normals = self._interpolate(self.point_normals, coordinates)
-        return normals / np.linalg.norm(normals, axis=1, keepdims=True)
+        return unit(self._interpolate(self.point_normals, coordinates))
 
     load_points = place
 
@@ -231,7 +221,7 @@ class CurvedRest(Rest):
 def rest_of(sheet: Sheet) -> Rest:
     """Return the sheet at rest; a PictureError if the file of its surface cannot be used."""
     file = sheet.surface.file if sheet.surface else None
-    return _rest(sheet.points, sheet.size, _Surface(sheet, file.sha256 if file else ""))
+    return _rest(sheet.points, sheet.size, sheet.surface, file.sha256 if file else "")
 
 
 def rest_normals(sheet: Sheet) -> Array:
@@ -246,67 +236,59 @@ def heights(displacement: NDArray[Any], sheet: Sheet) -> NDArray[Any]:
     return (displacement * rest.point_normals).sum(axis=-1) if isinstance(rest, CurvedRest) else displacement[..., 2]
 
 
-class _Surface:
-    """The surface of a sheet as the key of a cache: equal with equal keys and an equal file."""
-
-    def __init__(self, sheet: Sheet, sha256: str) -> None:
-        self.sheet, self._key = sheet, (sheet.surface, sha256)
-
-    def __eq__(self, other: object) -> bool:
-        return isinstance(other, _Surface) and self._key == other._key
-
-    def __hash__(self) -> int:
-        return hash(self._key)
-
-
 @lru_cache(maxsize=8)
-def _rest(points: tuple[int, int], size: tuple[float, float], surface: _Surface) -> Rest:
-    if surface.sheet.surface is None:
-        return FlatRest(points, size)
-    (rows, cols), (height, width) = points, size
-    u, v = np.arange(cols) / (cols - 1), np.arange(rows) / (rows - 1)
-    kind = surface.sheet.surface.kind
-    return CurvedRest(KINDS[kind](getattr(surface.sheet.surface, kind), u, v, width, height))
+def _rest(
+    points: tuple[int, int],
+    size: tuple[float, float],
+    surface: RestSurface | None,
+    sha256: str,  # noqa: ARG001  # of its file, part of the key of the cache
+) -> Rest:
+    flat = FlatRest(points, size)
+    return CurvedRest(KINDS[surface.kind](getattr(surface, surface.kind), flat.position)) if surface else flat
 
 
-def _height(field: HeightField, u: Array, v: Array, width: float, height: float) -> Array:
-    x, y = np.meshgrid((u - 0.5) * width, (0.5 - v) * height)
-    return np.stack([x, y, sample_bilinearly(field.heights.values, v, u)], axis=-1)
+def _height_positions(field: HeightField, flat: Array) -> Array:
+    """Return (x, y, z(u, v))."""
+    v, u = (np.arange(count) / (count - 1) for count in flat.shape[:2])
+    return np.dstack([flat[..., :2], sample_bilinearly(field.heights.values, v, u)])
 
 
-def _tube(tube: Tube, u: Array, v: Array, width: float, height: float) -> Array:
-    radius, (x, y) = tube.radius, np.meshgrid((u - 0.5) * width, (0.5 - v) * height)
+def _tube_positions(tube: Tube, flat: Array) -> Array:
+    """Return (r sin(x / R), y, R - r cos(x / R)), r = R - depth (1 + cos(2 pi y / spacing)) / 2."""
+    radius, x, y = tube.radius, flat[..., 0], flat[..., 1]
     r = np.full(x.shape, radius)
     if tube.folds is not None:
         r -= tube.folds.depth * (1 + np.cos(2 * np.pi * y / tube.folds.spacing)) / 2
     return np.stack([r * np.sin(x / radius), y, radius - r * np.cos(x / radius)], axis=-1)
 
 
-def _dome(dome: Dome, u: Array, v: Array, width: float, height: float) -> Array:
-    radius = dome.radius
-    x, y = (np.tan(each / radius) for each in np.meshgrid((u - 0.5) * width, (0.5 - v) * height))
-    length = np.sqrt(1 + x * x + y * y)
+def _dome_positions(dome: Dome, flat: Array) -> Array:
+    """Return R ((a, b, 1) / (1 + a^2 + b^2)^(1/2) - (0, 0, 1)), a = tan(x / R), b = tan(y / R)."""
+    a, b = np.tan(flat[..., 0] / dome.radius), np.tan(flat[..., 1] / dome.radius)
+    length = np.sqrt(1 + a * a + b * b)
     # 1 / length - 1 without cancellation.
-    return radius * np.stack([x / length, y / length, -(x * x + y * y) / (length * (1 + length))], axis=-1)
+    return dome.radius * np.stack([a / length, b / length, -(a * a + b * b) / (length * (1 + length))], axis=-1)
 
 
-def _points(grid: PointGrid, u: Array, v: Array, width: float, height: float) -> Array:  # noqa: ARG001
+def _point_positions(grid: PointGrid, flat: Array) -> Array:
+    """Return the points of the file, or with another number of points those of cubic splines in (u, v)."""
     from scipy.interpolate import CubicSpline
 
     positions = grid.points.values
-    if positions.shape[:2] == (len(v), len(u)):
+    if positions.shape[:2] == flat.shape[:2]:
         return positions.copy()
-    for axis, fractions in enumerate((v, u)):
-        positions = CubicSpline(np.linspace(0, 1, positions.shape[axis]), positions, axis)(fractions)
+    for axis, count in enumerate(flat.shape[:2]):
+        splines = CubicSpline(np.linspace(0, 1, positions.shape[axis]), positions, axis)
+        positions = splines(np.arange(count) / (count - 1))
     return positions
 
 
-# Positions of the mass points [m] of each kind of surface, for u of the columns and v of the rows.
-KINDS: dict[str, Callable[[Any, Array, Array, float, float], Array]] = {
-    "height": _height,
-    "tube": _tube,
-    "dome": _dome,
-    "points": _points,
+# Positions of the mass points [m] of each kind of surface, from those of the flat sheet, shape (rows, cols, 3) each.
+KINDS: dict[str, Callable[[Any, Array], Array]] = {
+    "height": _height_positions,
+    "tube": _tube_positions,
+    "dome": _dome_positions,
+    "points": _point_positions,
 }
 
 

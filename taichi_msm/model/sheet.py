@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 from taichi_msm.errors import Problem
 from taichi_msm.images import file_sha256, read_grey
 from taichi_msm.laws.law import LawNumbers
+from taichi_msm.model.cells import sum_around_points
 from taichi_msm.model.rest import rest_of, sample_bilinearly
 from taichi_msm.scene.scene import Scene
 from taichi_msm.scene.section import MAX_POINTS, Side
@@ -174,12 +175,7 @@ def map_factors(stiffness_map: StiffnessMap, image: MapImage, rows: Array, cols:
 
 def largest_mean(factors: Array) -> float:
     """Return the largest mean of the factors of the cells around a mass point."""
-    factor_sums, cell_counts = np.pad(factors, 1), np.pad(np.ones_like(factors), 1)
-
-    def sum_around_points(values: Array) -> Array:
-        return values[:-1, :-1] + values[:-1, 1:] + values[1:, :-1] + values[1:, 1:]
-
-    return float((sum_around_points(factor_sums) / sum_around_points(cell_counts)).max())
+    return float((sum_around_points(factors) / sum_around_points(np.ones_like(factors))).max())
 
 
 def area_shares(sheet: Sheet) -> Array:

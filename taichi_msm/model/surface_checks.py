@@ -14,7 +14,7 @@ from taichi_msm.model.rest import CurvedRest, rest_of
 from taichi_msm.scene.scene import Scene
 from taichi_msm.scene.section import MAX_POINTS
 
-# A sheet is refused if a larger share of its area than this has a larger isotropy error than that.
+# Tissue is refused if more than this share of its area has an isotropy error above MAX_ISOTROPY_ERROR.
 MAX_COARSE_SHARE, MAX_ISOTROPY_ERROR = 0.1, 0.5
 
 FOLD_REMEDY = "take more sheet.points, or a smoother surface"
@@ -26,7 +26,7 @@ Array = NDArray[np.float64]
 
 
 def surface_problems(scene: Scene) -> Iterator[Problem]:
-    """Yield the first fault of a sheet that is curved at rest."""
+    """Yield the first fault of a curved sheet at rest, and that of bending."""
     surface = scene.sheet.surface
     if surface is None:
         return

@@ -87,7 +87,8 @@ class Tool(ABC):
         """Return the largest displacement in a step [m], and the index of the keyframe after it.
 
         The path before keyframe `first` is ignored. As a function of the step's begin, the displacement is convex
-        between the times at which a keyframe enters or leaves the step. Its maximum is therefore at one of these times.
+        between the times at which a bend enters or leaves the step. Its maximum is therefore at one of these times; on
+        a curved sheet approximately, as the path between bends is nearly straight.
         """
         bends = self.bends
         begin = np.maximum([0.0, *bends, *(bends - step)], max(0.0, self.times[first] if first else 0.0))
@@ -139,9 +140,9 @@ class SolidTool(Tool):
         return self.path_length + self.radius
 
     def substep_times(self, begin: float, end: float) -> Array:
-        """Divide a time interval like a `Tool`, and so that a rough tool moves straight in each part."""
-        bends = self.times[self.rough & (self.times > begin) & (self.times < end)]
-        return np.union1d(super().substep_times(begin, end), bends)
+        """Divide a time interval like a `Tool`, and at the keyframes of a rough tool."""
+        keyframes = self.times[self.rough & (self.times > begin) & (self.times < end)]
+        return np.union1d(super().substep_times(begin, end), keyframes)
 
     def lowest_point(self, t: float) -> tuple[float, float, float]:
         x, y, z = (float(np.interp(t, self.times, each)) for each in (*self.path.T[:2], self.heights))
@@ -175,7 +176,7 @@ class SolidTool(Tool):
         return self.shape.gap(centre, self.axis, self.length, self.radius, half)
 
     def keys_at(self, centres: Array, sheet: Sheet) -> Array:
-        """Return across, down and height [m] of keyframes with c at places [m], shape (n, 3) each."""
+        """Return across, down and height [m] of keyframes for centres c of the tip [m], shape (n, 3) each."""
         heights = centres[:, 2:] - (self.path[0, 2] - self.heights[0])
         return np.concatenate([rest_of(sheet).fractions(centres[:, :2]), heights], axis=1)
 
@@ -280,7 +281,9 @@ class FollowingTool(SolidTool):
             return np.asarray((placed.path_at(np.zeros(1))[0] - centre) / size)
 
         for centre in centres:
-            keys.append(root(distance, keys[-1], centre, tol=1e-14).x)
+            found = root(distance, keys[-1], centre, tol=1e-14)
+            assert np.abs(found.fun).max() < 1e-9, found.message
+            keys.append(found.x)
         return np.array(keys[1:]) * (1, 1, size)
 
     def _follow(self, t: Array) -> tuple[Array, Array, Array]:
@@ -430,9 +433,9 @@ def path_warnings(scene: Scene, tools: Sequence[Tool]) -> Iterator[str]:
         if n not in solids:
             continue
         spacing_max, radius = solids[n].point_spacing(scene.sheet), solids[n].radius
-        if spacing_max > (least := MAX_SPACING_RADII * radius):
-            lengths = scene.sheet.size if rest.is_flat else [(n - 1) * spacing_max for n in scene.sheet.points]
-            points = [int(np.ceil(length / least)) + 1 for length in lengths]
+        if spacing_max > (limit := MAX_SPACING_RADII * radius):
+            lengths = scene.sheet.size if rest.is_flat else [(count - 1) * spacing_max for count in scene.sheet.points]
+            points = [int(np.ceil(length / limit)) + 1 for length in lengths]
             affordable = math.prod(points) <= MAX_POINTS_RATIO * math.prod(scene.sheet.points)
             remedy = f"try sheet.points: {points}" if affordable else "take a wider tip"
             yield (

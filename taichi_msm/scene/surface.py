@@ -6,16 +6,23 @@ from collections.abc import Callable, Collection
 from functools import cached_property
 from typing import Annotated, Literal
 
-from pydantic import ConfigDict, Field, model_validator
+from pydantic import AfterValidator, ConfigDict, model_validator
 from typing_extensions import Self
 
 from taichi_msm.array_files import ArrayFile, quantum, read_array_file
 from taichi_msm.images import PICTURE_SUFFIXES, file_sha256, read_grey
-from taichi_msm.scene.section import MAX_MAGNITUDE, FilePath, NotNegative, Number, Positive, Section, key, scene_fault
+from taichi_msm.scene.section import FilePath, NotNegative, Number, Positive, Section, key, scene_fault
 
 METRES = {"m": 1.0, "mm": 1e-3, "um": 1e-6}
 
-Radius = Annotated[Number, Field(ge=-MAX_MAGNITUDE, le=MAX_MAGNITUDE)]
+
+def _require_radius(value: float) -> float:
+    if value == 0:
+        raise scene_fault("0 is not allowed; expected a number other than 0, in metres")
+    return value
+
+
+Radius = Annotated[Number, AfterValidator(_require_radius)]
 Unit = Literal["m", "mm", "um"] | Positive
 _UNIT_EXPECTS = "m, mm, um, or a number above 0, in metres per count, such as 0.01 for cm"
 
@@ -70,7 +77,7 @@ class HeightField(Section):
 class Folds(Section):
     """Folds around a tube, like the haustra of a colon."""
 
-    depth: NotNegative = key(..., "how far the folds reach into the tube [m]", "a number, 0 or more, in metres")
+    depth: NotNegative = key(..., "height of the folds, inward [m]", "a number, 0 or more, in metres")
     spacing: Positive = key(..., "distance of two folds along the tube [m]", "a number above 0, in metres")
 
 
@@ -83,9 +90,7 @@ class Tube(Section):
     folds: Folds | None = key(None, "folds around the tube", "a mapping: {depth: [m], spacing: [m]}")
 
     @model_validator(mode="after")
-    def _check_radius(self) -> Self:
-        if self.radius == 0:
-            raise scene_fault("0 is not allowed; expected a number other than 0, in metres", "radius")
+    def _check_folds(self) -> Self:
         if self.folds is not None and 0 < self.radius <= self.folds.depth:
             text = f"{self.folds.depth:g} m reach the axis of a tube of {self.radius:g} m; take less than the radius"
             raise scene_fault(text, "folds", "depth")
@@ -96,12 +101,6 @@ class Dome(Section):
     """A part of a sphere."""
 
     radius: Radius = key(..., "radius [m]; below 0 for a bowl", "a number other than 0, in metres")
-
-    @model_validator(mode="after")
-    def _check_radius(self) -> Self:
-        if self.radius == 0:
-            raise scene_fault("0 is not allowed; expected a number other than 0, in metres", "radius")
-        return self
 
 
 class PointGrid(Section):
@@ -142,7 +141,7 @@ class RestSurface(Section):
     points: PointGrid | None = key(None, "positions of a grid of points", "a mapping with file and unit")
 
     @property
-    def _given(self) -> list[str]:
+    def _given_kinds(self) -> list[str]:
         """Names of the given kinds."""
         # Iteration over a model would include its cached properties.
         return [name for name in type(self).model_fields if getattr(self, name) is not None]
@@ -150,7 +149,7 @@ class RestSurface(Section):
     @property
     def kind(self) -> str:
         """Name of the kind."""
-        return self._given[0]
+        return self._given_kinds[0]
 
     @cached_property
     def file(self) -> ArrayFile | None:
@@ -174,18 +173,16 @@ class RestSurface(Section):
     def with_path(self, path: Callable[[str], str]) -> RestSurface:
         """Return a copy with the path p of the file, if the kind has one, replaced by `path(p)`."""
         section = self.height or self.points
-        return (
-            self.model_copy(update={self.kind: section.model_copy(update={"file": path(section.file)})})
-            if section
-            else self
-        )
+        if section is None:
+            return self
+        return self.model_copy(update={self.kind: section.model_copy(update={"file": path(section.file)})})
 
     @model_validator(mode="after")
     def _check_one_kind(self) -> Self:
-        if not self._given:
+        if not self._given_kinds:
             raise scene_fault("is empty; expected one of height, tube, dome, points")
-        if len(self._given) > 1:
-            raise scene_fault(f"conflicts with {self.kind}; remove one of them", self._given[1])
+        if len(self._given_kinds) > 1:
+            raise scene_fault(f"conflicts with {self.kind}; remove one of them", self._given_kinds[1])
         return self
 
 

@@ -38,7 +38,7 @@ COUNTER_STRIDE = 16
 WORKER_STRIDE = 2 * COUNTER_STRIDE
 PASS_INDEX, ROUND, STEP = 1, 2, 3
 
-# Rows of moments per worker.
+# Rows of moments per worker: the force on a row depends on those of the previous, this and the next row.
 MOMENT_ROWS = 3
 
 
@@ -96,8 +96,8 @@ def build_step_row(
 ) -> Callable[..., Any]:
     """Build the Taichi function step_row(sheet, carried, loads, band, row, n, steps_before, carry, moments).
 
-    It steps a row of a band as soon as the neighbours' rows are available. `move` steps an entry, see `build_pass_row`;
-    the corrections of terms follow if it `corrects`; `parallel` bands have neighbours.
+    It steps a row of a band as soon as the neighbours' rows are available. `move` steps an entry, see `build_pass_row`.
+    With `corrects`, the corrections of terms follow. With `parallel`, the bands next to it belong to other workers.
     """
     vector, bending, copied = config.vector, config.get(BendingTerm), config.reach
     fill_halo = build_fill_halo(config)

@@ -213,7 +213,7 @@ class Sweep:
         for name, value in self.settings.set.items():
             _map_files(_split_key(name), value, collect)
         for name, distribution in self.settings.vary.items():
-            for value in distribution.values if distribution.kind in ("choice", "grid") else ():
+            for value in distribution.values:
                 _map_files(_split_key(name), value, collect)
         digests = {}
         for path in dict.fromkeys(str(self.scene.folder / name) for name in names):
@@ -328,7 +328,7 @@ def _relocate(vary: dict[str, Any], fixed: dict[str, Any], folder: Path, scene_f
     """Expand file patterns, and make paths relative to the scene's folder; in place. Yield the errors."""
     places: list[tuple[Key, Any]] = []  # key of each value, and the list or dict that contains it
     for name, distribution in vary.items():
-        for kind in {"choice", "grid"} & set(distribution if isinstance(distribution, dict) else ()):
+        for kind in [each for each in ("choice", "grid") if isinstance(distribution, dict) and each in distribution]:
             key = _split_key(name)
             if isinstance(pattern := distribution[kind], str) and scene_file.names_file(key):
                 distribution[kind] = _matching_files(pattern, folder, key)

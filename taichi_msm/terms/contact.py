@@ -42,21 +42,24 @@ from taichi_msm.terms.base import DY, TOP_Y, Correction, KernelConfig, RestCorre
 from taichi_msm.terms.places import Places
 from taichi_msm.terms.points import build_point_functions
 
-# Columns of a tool in the load table; a clamp has neither axis nor radius.
+# Columns of a tool in the load table; those from `axis` on are 0 for a clamp.
 TOOL = Places(
     tip_after=3,  # c after the step [m]
     tip_before=3,  # c before the step [m]
-    grip_state=1,
+    grip_state=1,  # GRIP_BEGINS, GRIP_CONTINUES or 0
     grip_shift=3,  # displacement of the tool since its grip began [m]
     axis=3,  # unit vector from the tip along the shaft
     axis_length=1,  # [m]
     radius=1,  # [m]
-    friction=1,
+    friction=1,  # Coulomb's coefficient; infinite if rough
     inverse_axis=2,  # reciprocals of y and z of the axis
 )
 
 # States of a grip in a step; 0 without one.
 GRIP_BEGINS, GRIP_CONTINUES = 1.0, 2.0
+
+# Iterations of projected Gauss-Seidel, where several tools may touch a mass point.
+MAX_ITERATIONS = 8
 
 # Holder of a mass point that no tool holds.
 FREE = 0
@@ -72,13 +75,13 @@ def stuck_to(tool: int, tools: int) -> int:
     return 1 + tools + tool
 
 
-def contact_fields(tools: int) -> Places:
-    """Return the fields of contact; a scene without grips has only the corrections.
+def contact_fields(tools: int, *, grips: bool = True) -> Places:
+    """Return the fields of contact; without grips only the corrections.
 
     The hold of a gripped mass point is its displacement when the grip began [m]; that of a stuck one is its
     displacement relative to the tip.
     """
-    return Places(corrections=[3] * tools, holder=1, hold=3)
+    return Places(corrections=[3] * tools, holder=int(grips), hold=3 * grips)
 
 
 @dataclass(frozen=True)
@@ -111,8 +114,7 @@ class ContactTerm(Term):
 
     @property
     def field_places(self) -> Places:
-        places = contact_fields(len(self.shapes))
-        return places if self.grips else Places(corrections=[3] * len(self.shapes))
+        return contact_fields(len(self.shapes), grips=self.grips)
 
     def fields(self, plan: Plan) -> NDArray[Any]:
         fields = super().fields(plan)
@@ -377,4 +379,4 @@ class ContactTerm(Term):
 
     @property
     def _iterations(self) -> int:
-        return 8 if len(self.shapes) > 1 else 1
+        return MAX_ITERATIONS if len(self.shapes) > 1 else 1

@@ -4,14 +4,14 @@ Scene: `springs.structural`, `springs.shear` and `springs.map`, or `tissue.young
 
 `terms.law` contains the force of a spring. The forces on its two ends are equal and opposite.
 
-In tissue each cell, with sides dx and dy and the map's factor f, adds stiffness to the springs along its edges and
+In flat tissue each cell, with sides dx and dy and the map's factor f, adds stiffness to the springs along its edges and
 diagonals:
 
     along x     f E t (9/8 dy/dx - 3/8 dx/dy) / 2        along y: the same with x and y exchanged
     diagonals   f 3/16 E t (dx^2 + dy^2) / (dx dy)
 
 The lattice then approximates an isotropic sheet in plane stress. Springs imply Poisson's ratio 1/3; docs/model.md
-contains the derivation.
+contains the derivation, and `model.cells` the stiffness of curved tissue.
 
 Under a pretension S a spring of rest length L0 has the tension tau L0 at rest, where tau = k1 e, k1 is its stiffness
 for f = 1, and e = S / (3/2 E t).
@@ -41,7 +41,7 @@ from taichi_msm.terms.law import build_pull_of_squares, build_spring, law_places
 from taichi_msm.terms.places import Places
 from taichi_msm.terms.points import build_point_functions
 
-# Families of springs with constants of their own, and with fields of their own: the diagonals of a cell differ there.
+# Families of springs. Both diagonals have the constants DIAGONAL, but fields of their own, FALLING and RISING.
 ALONG_ROW, ALONG_COLUMN, DIAGONAL = range(3)
 FALLING, RISING, FAMILIES = 2, 3, 4
 
@@ -79,7 +79,7 @@ class SpringTerm(Term):
 
     @property
     def tense_edges(self) -> bool:
-        """Whether the sheet is under tension at rest and has clamped edges, which can move."""
+        """Whether the sheet is under tension at rest and has mass points at an edge that can move."""
         return self.tense and self.open_edges
 
     @property
@@ -378,7 +378,7 @@ class SpringTerm(Term):
         return force_on_right, force_on_other
 
     def build_spring_tangent(self, config: KernelConfig) -> Callable[..., Any]:
-        """Build the Taichi function that differentiates the force of a mass point P on its neighbour Q.
+        """Build the Taichi function that differentiates the force of a mass point P on its neighbour Q on a flat sheet.
 
         If q = u_P - u_Q changes by p, the force of a linear law changes by
 
@@ -561,22 +561,23 @@ def curved_springs(material: Material, sheet: Sheet, rest: CurvedRest, membrane:
     ]
 
     def stiffness_of(cell: CellStiffness) -> list[NDArray[Any]]:
-        above_and_below, left_and_right = np.pad(cell.along_a, ((1, 1), (0, 0))), np.pad(cell.along_b, ((0, 0), (1, 1)))
-        along_rows, along_columns = (
-            above_and_below[:-1] + above_and_below[1:],
-            left_and_right[:, :-1] + left_and_right[:, 1:],
-        )
-        families = along_rows, along_columns, cell.falling, cell.rising
+        families = *_sum_beside(cell.along_a, cell.along_b), cell.falling, cell.rising
         return [k * square for k, square in zip(families, squares, strict=True)]
 
     cell = cell_stiffness(rest.cells, membrane * _factors(material, sheet))
     stiffness, unmapped = stiffness_of(cell), stiffness_of(cell_stiffness(rest.cells, membrane))
-    # Bound of each cell: the larger of its two sides along a and along b, its diagonals, with its own stiffness alone.
+    # Bound of each cell from its stiffness alone: k_a and k_b of its longer sides, k_m and k_n of its diagonals.
     k_a = cell.along_a * np.maximum(squares[ALONG_ROW][:-1], squares[ALONG_ROW][1:])
     k_b = cell.along_b * np.maximum(squares[ALONG_COLUMN][:, :-1], squares[ALONG_COLUMN][:, 1:])
     k_m, k_n = stiffness[FALLING:]
     bounds = np.maximum(2 * (k_a + k_b), k_a + k_b + k_m + k_n + np.hypot(k_a - k_b, k_m - k_n))
     return Springs(stiffness, [k * material.tension for k in unmapped], rest.position, sum_around_points(bounds))
+
+
+def _sum_beside(along_rows: NDArray[Any], along_columns: NDArray[Any]) -> tuple[NDArray[Any], NDArray[Any]]:
+    """Sum numbers of cells over the cells next to each spring along rows, and next to each one along columns."""
+    above_and_below, left_and_right = np.pad(along_rows, ((1, 1), (0, 0))), np.pad(along_columns, ((0, 0), (1, 1)))
+    return above_and_below[:-1] + above_and_below[1:], left_and_right[:, :-1] + left_and_right[:, 1:]
 
 
 def _factors(material: Material, sheet: Sheet) -> NDArray[Any]:
@@ -589,9 +590,8 @@ def spring_stiffness(material: Material, factors: NDArray[Any]) -> tuple[NDArray
 
     The shapes are those of `Springs` for springs along rows, along columns and along both diagonals of a cell.
     """
-    above_and_below, left_and_right = np.pad(factors, ((1, 1), (0, 0))), np.pad(factors, ((0, 0), (1, 1)))
-    across = material.across / 2 * (above_and_below[:-1] + above_and_below[1:])
-    down = material.down / 2 * (left_and_right[:, :-1] + left_and_right[:, 1:])
+    along_rows, along_columns = _sum_beside(factors, factors)
+    across, down = material.across / 2 * along_rows, material.down / 2 * along_columns
     if not material.by_area:
         # In scenes with `springs`, springs at an edge are as stiff as all others.
         across[[0, -1]] *= 2
