@@ -6,6 +6,10 @@ from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
+
+# Numbers of the model, but for those of kernels in f32.
+Array = NDArray[np.float64]
 
 
 class Operations(NamedTuple):

@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
+from taichi_msm.arithmetic import Array
 from taichi_msm.errors import ArgumentError
 from taichi_msm.exports.formats import ANY_CAMERA, FORMATS
 from taichi_msm.model.surface import Solid, refine_surface
@@ -120,8 +121,6 @@ def read_picture_file(run: FinishedRun, key: str, frame: int) -> bytes:
     with reading(path):
         return read_regular(path, MAX_RECORD_BYTES)
 
-
-Array = NDArray[np.float64]
 
 # Coordinate of the first pixel's centre [px]; it is 0 in OpenCV.
 FIRST_PIXEL_CENTRE = 0.5

@@ -6,7 +6,8 @@ from collections.abc import Iterator, Sequence
 
 import numpy as np
 
-from taichi_msm.fitting.observation import Array, Observation
+from taichi_msm.arithmetic import Array
+from taichi_msm.fitting.observation import Observation
 from taichi_msm.fitting.points import ROUNDING_SHARE
 from taichi_msm.fitting.predict import FitProblem, Prediction
 from taichi_msm.model.rest import rest_of

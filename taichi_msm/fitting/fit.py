@@ -14,6 +14,7 @@ import numpy as np
 from typing_extensions import Unpack
 
 from taichi_msm.accuracy.mesh import CONTACT_ORDER
+from taichi_msm.arithmetic import Array
 from taichi_msm.errors import SceneError, StageProgressCallback, writing
 from taichi_msm.fitting import rejection
 from taichi_msm.fitting.archive import read_observations
@@ -23,7 +24,7 @@ from taichi_msm.fitting.least_squares import Misfit, Search, Solution
 from taichi_msm.fitting.machine_curve import CurveRuns, has_curve, search_by_curve
 from taichi_msm.fitting.machine_fit import FittedTest, contact_notes, explanations, fitted_tests, unknown_notes
 from taichi_msm.fitting.machine_model import TABLE_OPTIONS, MachineProblem, read_machine_problem, table_paths
-from taichi_msm.fitting.observation import Array, ErrorCorrelation, Observation
+from taichi_msm.fitting.observation import ErrorCorrelation, Observation
 from taichi_msm.fitting.outliers import LeftOut, leave_out
 from taichi_msm.fitting.parameters import (
     Bounds,

@@ -16,9 +16,10 @@ from typing import Any, ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
+from taichi_msm.arithmetic import Array
 from taichi_msm.errors import SceneError
 from taichi_msm.fitting import observation
-from taichi_msm.fitting.observation import Array, Observation, ObservationModel, root_mean_square
+from taichi_msm.fitting.observation import Observation, ObservationModel, root_mean_square
 from taichi_msm.fitting.panels import Panel, plot_forces
 from taichi_msm.machines.cells import Row, decimal_mark, read_text
 from taichi_msm.runs.simulation import Simulation

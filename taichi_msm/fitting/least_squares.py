@@ -13,8 +13,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from taichi_msm.arithmetic import Array
 from taichi_msm.errors import SceneError
-from taichi_msm.fitting.observation import Array, Observation
+from taichi_msm.fitting.observation import Observation
 from taichi_msm.fitting.predict import Prediction, Runs
 
 # Largest residual with almost full weight in robust fits, in sigma.

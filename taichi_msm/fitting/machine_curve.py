@@ -24,10 +24,10 @@ from typing import NamedTuple
 
 import numpy as np
 
+from taichi_msm.arithmetic import Array
 from taichi_msm.errors import DivergedError, SceneError, StageProgressCallback
 from taichi_msm.fitting.least_squares import Misfit, Search, Solution
 from taichi_msm.fitting.machine_model import MachineModel, MachineProblem
-from taichi_msm.fitting.observation import Array
 from taichi_msm.fitting.parameters import with_values
 from taichi_msm.fitting.predict import FitProblem, Prediction, Runs, mesh_error
 from taichi_msm.load.check import check_scene

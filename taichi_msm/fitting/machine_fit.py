@@ -9,8 +9,8 @@ from typing import Any
 
 import numpy as np
 
+from taichi_msm.arithmetic import Array
 from taichi_msm.fitting.machine_model import MachineProblem
-from taichi_msm.fitting.observation import Array
 from taichi_msm.fitting.parameters import Parameter, rounded
 from taichi_msm.fitting.uncertainty import Uncertainty
 from taichi_msm.machines.loading import CONTACT_NOISES, Loading

@@ -9,9 +9,10 @@ from typing import Any, ClassVar
 
 import numpy as np
 
+from taichi_msm.arithmetic import Array
 from taichi_msm.errors import Pause, SceneError
 from taichi_msm.fitting.forces import Forces
-from taichi_msm.fitting.observation import Array, ObservationModel
+from taichi_msm.fitting.observation import ObservationModel
 from taichi_msm.fitting.panels import Panel
 from taichi_msm.fitting.parameters import Parameter, Request, as_data, make_parameters, with_values
 from taichi_msm.fitting.predict import FitProblem, ForwardModel, Prediction, without_outputs

@@ -13,13 +13,12 @@ import numpy as np
 from numpy.typing import NDArray
 from typing_extensions import Self
 
+from taichi_msm.arithmetic import Array
 from taichi_msm.errors import SceneError
 from taichi_msm.fitting.panels import Panel, plot_match
 from taichi_msm.runs.simulation import Simulation
 from taichi_msm.scene.scene import Scene
 from taichi_msm.scene.section import MAX_MAGNITUDE, MIN_MAGNITUDE
-
-Array = NDArray[np.float64]
 
 # Largest residual of a good fit, as a share of the signal and in sigma.
 MAX_RESIDUAL_SHARE, MAX_RESIDUAL_SIGMAS = 0.1, 2.0

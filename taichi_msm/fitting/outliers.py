@@ -14,8 +14,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from taichi_msm.arithmetic import Array
 from taichi_msm.fitting.least_squares import Misfit, Search, Solution
-from taichi_msm.fitting.observation import Array, Observation
+from taichi_msm.fitting.observation import Observation
 from taichi_msm.fitting.parameters import rounded
 
 # Probability that normal errors exceed the limit of a sample.

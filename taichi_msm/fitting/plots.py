@@ -20,9 +20,9 @@ from matplotlib.patches import Rectangle
 from matplotlib.ticker import LogLocator, MaxNLocator, NullFormatter, ScalarFormatter
 from numpy.typing import NDArray
 
+from taichi_msm.arithmetic import Array
 from taichi_msm.errors import printable
 from taichi_msm.fitting.machine_fit import FittedTest
-from taichi_msm.fitting.observation import Array
 from taichi_msm.fitting.panels import Panel
 from taichi_msm.fitting.result import FitResult, FittedMap
 from taichi_msm.fitting.tikhonov import SmoothnessWeight

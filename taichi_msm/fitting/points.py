@@ -16,8 +16,9 @@ from typing import ClassVar, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from taichi_msm.arithmetic import Array
 from taichi_msm.fitting import observation, rejection
-from taichi_msm.fitting.observation import Array, ErrorCorrelation, Observation, ObservationModel
+from taichi_msm.fitting.observation import ErrorCorrelation, Observation, ObservationModel
 from taichi_msm.fitting.panels import Panel, plot_match, plot_motion, plot_on_sheet
 from taichi_msm.model.rest import rest_of
 from taichi_msm.model.surface import surface_weights

@@ -16,8 +16,9 @@ import numpy as np
 from typing_extensions import Self
 
 from taichi_msm.accuracy.mesh import coarser_plan, estimate_mesh_error
+from taichi_msm.arithmetic import Array
 from taichi_msm.errors import DivergedError, ExecutorError, Pause, SceneError, StageProgressCallback
-from taichi_msm.fitting.observation import Array, Observation, ObservationModel, time_in_frames
+from taichi_msm.fitting.observation import Observation, ObservationModel, time_in_frames
 from taichi_msm.fitting.parameters import Parameter, as_data, with_values
 from taichi_msm.load import cost
 from taichi_msm.load.check import check_scene

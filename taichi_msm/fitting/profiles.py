@@ -13,8 +13,8 @@ from typing import NamedTuple
 
 import numpy as np
 
+from taichi_msm.arithmetic import Array
 from taichi_msm.fitting.least_squares import Misfit, Solution
-from taichi_msm.fitting.observation import Array
 from taichi_msm.fitting.predict import Prediction, Runs
 from taichi_msm.fitting.uncertainty import Uncertainty
 

@@ -19,7 +19,8 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from taichi_msm.fitting.observation import Array, ErrorCorrelation
+from taichi_msm.arithmetic import Array
+from taichi_msm.fitting.observation import ErrorCorrelation
 
 # Smallest probability of a model that is not rejected.
 MIN_PROBABILITY = 1e-3

@@ -10,8 +10,9 @@ from typing import Any, ClassVar, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from taichi_msm.arithmetic import Array
 from taichi_msm.fitting.machine_fit import FittedTest
-from taichi_msm.fitting.observation import Array, Observation, root_mean_square
+from taichi_msm.fitting.observation import Observation, root_mean_square
 from taichi_msm.fitting.outliers import LeftOut
 from taichi_msm.fitting.parameters import rounded
 from taichi_msm.fitting.profiles import ProfilePoint

@@ -10,9 +10,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from taichi_msm.accuracy.mesh import coarser_plan
+from taichi_msm.arithmetic import Array
 from taichi_msm.errors import SceneError, StageProgressCallback
 from taichi_msm.fitting.checks import faults, faults_at_start
-from taichi_msm.fitting.observation import Array
 from taichi_msm.fitting.parameters import Bounds, Parameter, Request, make_parameters, rounded
 from taichi_msm.fitting.points import PointModel, PointObservation
 from taichi_msm.fitting.predict import FitProblem, Prediction, mesh_error, without_outputs

@@ -24,8 +24,8 @@ from typing import NamedTuple
 
 import numpy as np
 
+from taichi_msm.arithmetic import Array
 from taichi_msm.errors import SceneError
-from taichi_msm.fitting.observation import Array
 from taichi_msm.fitting.parameters import Bounds
 from taichi_msm.fitting.points import PointModel, PointObservation
 from taichi_msm.gradients.gradient import Adjoint

@@ -30,8 +30,9 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from taichi_msm.arithmetic import Array
 from taichi_msm.fitting.least_squares import Misfit, Scales, Solution
-from taichi_msm.fitting.observation import Array, ErrorCorrelation
+from taichi_msm.fitting.observation import ErrorCorrelation
 from taichi_msm.fitting.parameters import Parameter, rounded
 
 # Largest standard deviation of an identified direction.

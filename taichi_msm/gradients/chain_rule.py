@@ -18,6 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import BaseModel
 
+from taichi_msm.arithmetic import Array
 from taichi_msm.laws import law_of
 from taichi_msm.model.loads import Schedule
 from taichi_msm.model.plan import Plan, ProbeSegment
@@ -28,8 +29,6 @@ from taichi_msm.scene.sheet import Foundation
 from taichi_msm.scene.tools import Probe
 from taichi_msm.terms import derive_material
 from taichi_msm.terms.springs import spring_stiffness
-
-Array = NDArray[np.float64]
 
 # Imaginary part of the complex steps.
 COMPLEX_STEP = 1e-60

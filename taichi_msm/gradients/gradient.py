@@ -8,8 +8,8 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from taichi_msm.arithmetic import Array
 from taichi_msm.errors import ArgumentError, Pause, SceneError, as_array, is_real_array
 from taichi_msm.gradients.chain_rule import Derivatives, scene_derivatives
 from taichi_msm.gradients.motion import MotionAdjoint, motion_bytes
@@ -24,9 +24,6 @@ from taichi_msm.system import runtime
 from taichi_msm.system.process import available_memory
 from taichi_msm.system.runtime import Device
 from taichi_msm.terms import build_terms
-
-Array = NDArray[np.float64]
-
 
 _NUMBERS = "fit numbers instead of a map, or take finite differences"
 

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from taichi_msm.accuracy import divergence
 from taichi_msm.accuracy.divergence import DivergenceMonitor
+from taichi_msm.arithmetic import Array
 from taichi_msm.errors import DivergedError, Pause
 from taichi_msm.gradients import kernel_motion as kernels
 from taichi_msm.gradients.chain_rule import LoadGradient, SheetGradient
@@ -38,8 +39,6 @@ SEGMENT_BYTES = 64 * 2**20
 # Number of times that a worker checks its neighbour before it gives up. It is larger than in the forward run, because
 # giving up is more expensive: the kernel of the single worker that finishes the launch may not be compiled yet.
 MAX_WAIT_CHECKS = 8 * MAX_CHECKS
-
-Array = NDArray[np.float64]
 
 
 def _segment_steps(steps: int, step_bytes: int) -> int:

@@ -13,8 +13,8 @@ from threading import Thread
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from taichi_msm.arithmetic import Array
 from taichi_msm.errors import MsmError, Pause
 from taichi_msm.gradients.chain_rule import LoadGradient, SheetGradient
 from taichi_msm.laws.law import LawNumbers
@@ -28,8 +28,6 @@ from taichi_msm.terms.foundation import FoundationForce, foundation_force, point
 
 if TYPE_CHECKING:
     from scipy.sparse import csc_matrix
-
-Array = NDArray[np.float64]
 
 # Largest residual of a linear solution, relative to the right-hand side. Above it, the stiffness counts as singular.
 RESIDUAL_TOLERANCE = 1e-6

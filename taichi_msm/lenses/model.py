@@ -12,13 +12,9 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any, ClassVar, NamedTuple
 
-import numpy as np
 from numpy.polynomial import Polynomial
-from numpy.typing import NDArray
 
-from taichi_msm.arithmetic import Operations
-
-Array = NDArray[np.float64]
+from taichi_msm.arithmetic import Array, Operations
 
 # Maximum valid radius of any lens: 88 degrees from the optical axis.
 MAX_RADIUS = math.tan(math.radians(88))

@@ -18,9 +18,9 @@ from typing import Any, ClassVar
 import numpy as np
 from numpy.polynomial import Polynomial
 
-from taichi_msm.arithmetic import NUMPY, Operations
+from taichi_msm.arithmetic import NUMPY, Array, Operations
 from taichi_msm.lenses.fisheye import MIN_SQUARED_RADIUS
-from taichi_msm.lenses.model import MAX_RADIUS, Array, Coefficient, LensModel, positive_roots
+from taichi_msm.lenses.model import MAX_RADIUS, Coefficient, LensModel, positive_roots
 
 
 class Scaramuzza(LensModel):

@@ -19,8 +19,9 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from taichi_msm.arithmetic import Array
 from taichi_msm.errors import SceneError
-from taichi_msm.machines.reader import Array, MachineTest
+from taichi_msm.machines.reader import MachineTest
 from taichi_msm.model.rest import rest_of
 from taichi_msm.model.tools import SolidTool, Tool, build_tools
 from taichi_msm.scene.scene import Scene

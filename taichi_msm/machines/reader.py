@@ -15,13 +15,11 @@ from itertools import pairwise, product
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
+from taichi_msm.arithmetic import Array
 from taichi_msm.errors import SceneError, did_you_mean
 from taichi_msm.machines.cells import LETTER, WORKBOOK_SUFFIX, Grid, Row, parse_number, read_text
 from taichi_msm.machines.workbook import read_workbook
-
-Array = NDArray[np.float64]
 
 # Smallest number of rows of a test, and of those that the noise of the force is estimated from.
 MIN_ROWS = 10

@@ -22,7 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 from typing_extensions import Self
 
-Array = NDArray[np.float64]
+from taichi_msm.arithmetic import Array
 
 
 class Cells(NamedTuple):

@@ -18,6 +18,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from taichi_msm.arithmetic import Array
 from taichi_msm.model.plan import HAT_TOLERANCE, Plan, ProbeSegment, ProbeSlot, probe_slots
 from taichi_msm.model.rest import rest_of
 from taichi_msm.model.sheet import axes
@@ -26,8 +27,6 @@ from taichi_msm.scene.scene import Scene
 from taichi_msm.scene.section import FRAME_TOLERANCE
 from taichi_msm.scene.sheet import Sheet
 from taichi_msm.scene.tools import Probe
-
-Array = NDArray[np.float64]
 
 
 class Schedule(NamedTuple):

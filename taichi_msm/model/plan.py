@@ -9,6 +9,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from taichi_msm.arithmetic import Array
 from taichi_msm.integrators import Coefficients
 from taichi_msm.model.sheet import Maps, Material, has_fixed_border, point_areas
 from taichi_msm.model.time_grid import TimeGrid
@@ -21,8 +22,6 @@ from taichi_msm.scene.tools import Probe
 # Keyframes closer to an end of the hat than this fraction of its half-width count as outside: their contribution is
 # below rounding.
 HAT_TOLERANCE = 1e-9
-
-Array = NDArray[np.float64]
 
 
 class ProbeSegment(NamedTuple):

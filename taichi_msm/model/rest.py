@@ -15,11 +15,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from taichi_msm.arithmetic import Array
 from taichi_msm.model.cells import Cells, isotropy_errors, sum_around_points, unit
 from taichi_msm.scene.sheet import Sheet
 from taichi_msm.scene.surface import Dome, HeightField, PointGrid, RestSurface, Tube
-
-Array = NDArray[np.float64]
 
 
 class Rest(ABC):

@@ -16,6 +16,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from taichi_msm.arithmetic import Array
 from taichi_msm.errors import Problem
 from taichi_msm.images import file_sha256, read_grey
 from taichi_msm.laws.law import LawNumbers
@@ -34,8 +35,6 @@ MAX_CELL_ASPECT = math.sqrt(3)
 
 # Mass points of each side, as indices of an array of shape (rows, cols).
 SIDES: dict[Side, Any] = {"top": np.s_[0], "bottom": np.s_[-1], "left": np.s_[:, 0], "right": np.s_[:, -1]}
-
-Array = NDArray[np.float64]
 
 
 def spacing(sheet: Sheet) -> tuple[float, float]:

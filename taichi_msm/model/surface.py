@@ -7,6 +7,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from taichi_msm.arithmetic import Array
 from taichi_msm.model.rest import rest_of
 from taichi_msm.model.tool_force import control_point
 from taichi_msm.model.tools import build_tools, solid_tools, unit_vector
@@ -15,8 +16,6 @@ from taichi_msm.scene.sheet import Sheet
 from taichi_msm.scene.tools import Instrument
 from taichi_msm.shapes import SHAPES
 from taichi_msm.shapes.shape import Shape
-
-Array = NDArray[np.float64]
 
 
 def to_positions(displacement: NDArray[Any], sheet: Sheet) -> NDArray[Any]:

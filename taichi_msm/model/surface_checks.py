@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from taichi_msm.arithmetic import Array
 from taichi_msm.errors import Problem
 from taichi_msm.images import PictureError
 from taichi_msm.model.rest import CurvedRest, rest_of
@@ -21,8 +22,6 @@ FOLD_REMEDY = "take more sheet.points, or a smoother surface"
 
 # Smallest sine of the angle between the sides of a cell.
 MIN_SINE = 1e-6
-
-Array = NDArray[np.float64]
 
 
 def surface_problems(scene: Scene) -> Iterator[Problem]:

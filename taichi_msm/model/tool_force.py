@@ -19,15 +19,13 @@ from collections.abc import Iterator, Sequence
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 from typing_extensions import TypedDict
 
+from taichi_msm.arithmetic import Array
 from taichi_msm.model.rest import CurvedRest, rest_of
 from taichi_msm.scene.scene import Scene
 from taichi_msm.scene.sheet import Sheet
 from taichi_msm.scene.tools import Probe
-
-Array = NDArray[np.float64]
 
 # A warning is issued if the ratio of the force on the sheet to `total` is below this value or above its inverse.
 MIN_FORCE_RATIO = 0.8

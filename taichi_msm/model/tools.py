@@ -20,7 +20,7 @@ from itertools import combinations
 import numpy as np
 from numpy.typing import NDArray
 
-from taichi_msm.arithmetic import NUMPY
+from taichi_msm.arithmetic import NUMPY, Array
 from taichi_msm.errors import Problem
 from taichi_msm.model.rest import Rest, rest_of
 from taichi_msm.model.sheet import SIDES, fixed_points, fixed_sides, rest_positions
@@ -45,8 +45,6 @@ MAX_POINTS_RATIO = 4
 
 # A grip holds the mass points within this distance of the tip's centre, in radii of the tip.
 GRIP_RADII = 1.5
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)

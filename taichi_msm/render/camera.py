@@ -10,6 +10,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from taichi_msm.arithmetic import Array
 from taichi_msm.errors import Key, Problem, SceneError
 from taichi_msm.lenses.model import MAX_RADIUS
 from taichi_msm.model.rest import rest_of
@@ -20,8 +21,6 @@ from taichi_msm.scene.outputs import OUTPUTS
 from taichi_msm.scene.render import AnyCamera
 from taichi_msm.scene.scene import Scene
 from taichi_msm.scene.section import FRAME_TOLERANCE, MAX_SUPERSAMPLE, MIN_MAGNITUDE
-
-Array = NDArray[np.float64]
 
 # Field of view of the presets oblique and fit [degrees].
 OBLIQUE_FOV = 32.0

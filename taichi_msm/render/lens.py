@@ -6,13 +6,10 @@ from functools import lru_cache
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
-from taichi_msm.arithmetic import NUMPY
+from taichi_msm.arithmetic import NUMPY, Array
 from taichi_msm.dual import DUAL, Dual
 from taichi_msm.lenses import MODELS
-
-Array = NDArray[np.float64]
 
 # Maximum residual of the undistortion, in normalised image coordinates; well below 1e-6 px.
 UNDISTORTION_TOLERANCE = 1e-11

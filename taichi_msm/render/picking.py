@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from taichi_msm.arithmetic import Array
 from taichi_msm.model.crossings import cells_on_line
 from taichi_msm.model.rest import rest_of
 from taichi_msm.render.camera import View
@@ -13,7 +14,6 @@ from taichi_msm.scene.sheet import Sheet
 # Number of cells that are processed at a time, to bound the memory.
 CELLS_PER_BATCH = 1024
 
-Array = NDArray[np.float64]
 Pair = tuple[float, float]
 
 

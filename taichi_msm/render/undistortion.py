@@ -14,7 +14,6 @@ from numpy.typing import NDArray
 from taichi_msm.render.camera import View, border_points
 from taichi_msm.render.lens import Lens
 
-Array = NDArray[np.float64]
 Pair = tuple[float, float]
 
 # Undistorted coordinate of a sample beyond the limit of the lens.

@@ -12,6 +12,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
+from taichi_msm.arithmetic import Array
 from taichi_msm.model.rest import rest_of
 from taichi_msm.model.surface import Solid
 from taichi_msm.render.camera import View
@@ -43,8 +44,6 @@ METAL_AMBIENT, METAL_DIFFUSE, METAL_MIRROR, METAL_GLOSS = 0.2, 0.35, 0.6, 0.7
 
 # Minimum depth at which metal is lit, as a fraction of the distance from the light to the main camera's target.
 METAL_NEAREST = 0.2
-
-Array = NDArray[np.float64]
 
 # Indices into the array of sizes: sizes of the sheet, the picture and its bins; counters of the workers, for rows
 # taken, rows projected and bands taken; levels of the texture, each with its first texel, width and height.

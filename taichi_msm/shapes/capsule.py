@@ -7,8 +7,8 @@ from typing import Any
 
 import numpy as np
 
-from taichi_msm.arithmetic import Operations
-from taichi_msm.shapes.shape import MIN_DISTANCE_M, Array, Shape
+from taichi_msm.arithmetic import Array, Operations
+from taichi_msm.shapes.shape import MIN_DISTANCE_M, Shape
 
 
 class Capsule(Shape):

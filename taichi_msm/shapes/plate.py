@@ -8,8 +8,8 @@ from typing import Any
 
 import numpy as np
 
-from taichi_msm.arithmetic import NUMPY, Operations
-from taichi_msm.shapes.shape import MIN_DISTANCE_M, Array, Shape
+from taichi_msm.arithmetic import NUMPY, Array, Operations
+from taichi_msm.shapes.shape import MIN_DISTANCE_M, Shape
 
 # Lower bound of divisors, for rays parallel to the axis or to the ends.
 MIN_COSINE = 1e-12

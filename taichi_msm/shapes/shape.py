@@ -11,12 +11,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable
 from typing import Any, ClassVar
 
-import numpy as np
-from numpy.typing import NDArray
-
-from taichi_msm.arithmetic import Operations
-
-Array = NDArray[np.float64]
+from taichi_msm.arithmetic import Array, Operations
 
 # Distances below this count as 0; the square is representable in f32.
 MIN_DISTANCE_M = 1e-18

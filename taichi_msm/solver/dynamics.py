@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from taichi_msm.arithmetic import Array
 from taichi_msm.errors import MsmError, Pause
 from taichi_msm.model.loads import FrameLoad, average_loads, decay
 from taichi_msm.model.plan import Plan
@@ -33,8 +34,6 @@ MAX_STEPS_PER_LAUNCH = 8192
 
 # Number of steps in a load table; a shorter one takes hardly less time to compute.
 STEPS_PER_TABLE = 4096
-
-Array = NDArray[np.float64]
 
 
 class Dynamics(SheetSolver[StepKernel]):

@@ -26,6 +26,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from taichi_msm.arithmetic import Array
 from taichi_msm.errors import DivergedError, Pause
 from taichi_msm.model.loads import evaluate_frame_loads
 from taichi_msm.model.plan import Plan
@@ -52,8 +53,6 @@ MIN_FORCE_N = 1e-30
 # takes up to 200. The fictitious masses are those of the locked sheet, which multiplies the evaluations by up to
 # sqrt(factor).
 MAX_EVALUATIONS = 2000
-
-Array = NDArray[np.float64]
 
 
 class QuasiStatics(SheetSolver[Relaxation]):

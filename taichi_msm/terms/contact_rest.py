@@ -15,14 +15,12 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from taichi_msm.arithmetic import NUMPY
+from taichi_msm.arithmetic import NUMPY, Array
 from taichi_msm.model.plan import Plan
 from taichi_msm.model.sheet import rest_positions
 from taichi_msm.model.tools import GRIP_RADII, SolidTool, Tool, clamps, grip_frames, solid_tools
 from taichi_msm.terms.contact import FREE, contact_fields, held_by, stuck_to
 from taichi_msm.terms.places import Places
-
-Array = NDArray[np.float64]
 
 
 def _has_grips(tools: int, memory: Array) -> bool:

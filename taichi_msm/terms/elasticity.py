@@ -6,15 +6,12 @@ from collections.abc import Iterator
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
-from taichi_msm.arithmetic import NUMPY
+from taichi_msm.arithmetic import NUMPY, Array
 from taichi_msm.model.plan import Plan
 from taichi_msm.model.rest import rest_of
 from taichi_msm.terms.law import SpringFunctions, build_spring
 from taichi_msm.terms.springs import Window, assemble_springs, spring_ends
-
-Array = NDArray[np.float64]
 
 
 class Elongation(NamedTuple):

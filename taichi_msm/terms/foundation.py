@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 from typing_extensions import Self
 
-from taichi_msm.arithmetic import NUMPY
+from taichi_msm.arithmetic import NUMPY, Array
 from taichi_msm.laws import law_of
 from taichi_msm.laws.law import Law, LawNumbers
 from taichi_msm.model.loads import Schedule
@@ -29,8 +29,6 @@ from taichi_msm.terms.base import KernelConfig, Term
 from taichi_msm.terms.law import build_law, law_places
 from taichi_msm.terms.places import Places
 from taichi_msm.terms.points import build_point_functions
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
