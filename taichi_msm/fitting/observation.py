@@ -80,7 +80,7 @@ class Observation(ABC):
 
     @property
     def freedom(self) -> int:
-        """Number of independent values, less that of offsets."""
+        """Number of measured values, less that of fitted offsets."""
         return int(self.known.sum())
 
     @property
@@ -93,7 +93,7 @@ class Observation(ABC):
 
         Args:
             rows: residuals, or their derivatives.
-            robust_factor: d(r) of the cost of residuals, as of `Misfit`, to minimise that.
+            robust_factor: d(r) of a robust cost, see `Misfit`; with it, the offset minimises this cost.
         """
         return rows
 
@@ -110,7 +110,7 @@ class Observation(ABC):
         return replace(self, sigma=value)
 
     def without(self, samples: NDArray[np.bool_]) -> Self:
-        """Return the observation without samples, a mask with the shape of the values without components."""
+        """Return a copy without the samples of a mask, which has the shape of the values without their last axis."""
         return replace(self, values=np.where(samples[..., None], np.nan, self.values))
 
     @abstractmethod
@@ -129,8 +129,8 @@ class Observation(ABC):
     def difference_step(self, scene: Scene) -> float:
         """Return the step of finite differences: a relative change of a parameter, or a share of its range.
 
-        Rounding errors e of the values [unit] require about sqrt(e / signal); by default they are those of f64.
-        Equilibria, solved to about 1e-6, and contacts, which change in jumps, require larger steps.
+        Errors e of the values [unit] require about sqrt(e / signal); by default they are those of a run in f64, some
+        1e-10 of the signal. Equilibria, solved to about 1e-6, and contacts, which change in jumps, require larger steps.
         """
         return 1e-2 if scene.time.at_rest or any(probe.moved for probe in scene.probes) else 1e-5
 
