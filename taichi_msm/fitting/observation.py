@@ -130,7 +130,8 @@ class Observation(ABC):
         """Return the step of finite differences: a relative change of a parameter, or a share of its range.
 
         Errors e of the values [unit] require about sqrt(e / signal); by default they are those of a run in f64, some
-        1e-10 of the signal. Equilibria, solved to about 1e-6, and contacts, which change in jumps, require larger steps.
+        1e-10 of the signal. Equilibria, solved to about 1e-6, and contacts, which change in jumps, require larger
+        steps.
         """
         return 1e-2 if scene.time.at_rest or any(probe.moved for probe in scene.probes) else 1e-5
 
