@@ -44,4 +44,4 @@ def _is_symmetric(plan: Plan) -> bool:
     """Return whether the mirror image of a motion, at the plane of the sheet at rest, is a solution, too."""
     forces = [probe.vector or (0, 0, 0) for probe in plan.scene.probes if probe.path is None]
     crosses = any(force[2] != 0 for force in forces) or any(tool.path[:, 2].any() for tool in plan.tools)
-    return not crosses and not solid_tools(plan.tools)
+    return not (plan.scene.sheet.surface or crosses or solid_tools(plan.tools))
