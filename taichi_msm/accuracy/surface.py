@@ -29,6 +29,9 @@ NOTED_ISOTROPY_ERROR, NOTED_ANGLE_DEGREES, NOTED_STEP = 0.1, 45.0, 1 / 20
 # Extent above which, and rise relative to it below which, a wrong unit is likely.
 MAX_EXTENT_M, MIN_RISE = 5.0, 1e-3
 
+# Distance from the origin, in lengths of the sheet, from which rounding matters.
+MAX_DISTANCE = 20.0
+
 
 class IsotropyRecord(TypedDict):
     """Isotropy errors of the cells, see `isotropy_errors`."""
@@ -83,6 +86,9 @@ def surface_notes(scene: Scene) -> Iterator[str]:
     extents = np.sort(np.ptp(rest.box, axis=0))
     if surface.points and extents[2] > MAX_EXTENT_M:
         yield f"sheet.surface.points: {extents[2]:.3g} m is long for tissue; if these are millimetres, take unit: mm"
+    elif (distance := float(np.linalg.norm(rest.box.mean(axis=0)))) > MAX_DISTANCE * extents[2]:
+        fault = f"{distance:.3g} m from the origin, {distance / extents[2]:.0f} times its length"
+        yield f"sheet.surface: {fault}, where f32 and pictures lose digits; subtract the mean of its points"
     elif not surface.points and extents[0] < MIN_RISE * extents[2]:
         rise = f"{extents[0]:.2g} m over {extents[2]:.3g} m"
         yield f"sheet.surface: nearly flat, as it rises by {rise}; lengths are in metres"
@@ -112,7 +118,7 @@ def describe_surface(plan: Plan) -> Iterator[str]:
         if plan.material.by_area:
             squares /= plan.area_shares
         if (ratio := math.sqrt(float(squares.max() / np.median(squares)))) > 1.05:
-            yield f"surface: its smallest cells make the stable step {ratio:.2g} times shorter than its median cells"
+            yield f"surface: its smallest or stiffest cells make the step {ratio:.2g} times shorter than median ones"
     if plan.material.is_tense:
         pulls = np.zeros(rest.position.shape)
         for family in spring_families(plan):

@@ -147,6 +147,8 @@ def _explain(fitted: FittedTest, *, fits_contact: bool) -> str:
     if not fits_contact and at_peak and (reason := _explain_by_another_contact(fitted, rising)):
         return reason
     depth, measured, model = travel[rising], loading.force[rising], predicted[rising]
+    if min(measured[-1], model[-1]) <= 0:
+        return ""  # A thin tool may touch no mass point.
     shares = []
     for force in (measured, model):
         at_half = float(np.interp(0.5 * depth[-1], np.maximum.accumulate(depth), force))

@@ -67,7 +67,8 @@ FORCE_BYTES = 6 * 8  # values in the checkpoint
 
 # Numbers in memory per mass point.
 STATE_NUMBERS = 6  # displacement and last difference
-CURVED_NUMBERS = 8  # of a curved sheet: mobility, rest position, stiffness of four springs
+CURVED_NUMBERS = 12  # of a curved sheet: mobility, rest position, stiffness and tension of four springs
+CURVED_BYTES = 500  # of a curved sheet at rest, with its cells and temporary arrays
 MAP_NUMBERS = {"map": 6, "foundation_map": 4}  # stiffness of three springs; factor of the foundation; temporary arrays
 OUTPUT_NUMBERS = 15  # copies at the start and for output
 
@@ -125,7 +126,8 @@ def estimate_budget(plan: Plan) -> Budget:
     track_bytes *= cameras
     force_rows = frames * len(scene.probes)
     surface = scene.sheet.surface
-    file_bytes = surface.file.values.nbytes if surface and surface.file else 0
+    surface_bytes = surface.file.values.nbytes if surface and surface.file else 0
+    surface_bytes += CURVED_BYTES * points * (surface is not None)
     memory_numbers = len(memory_names(plan))
     numbers = STATE_NUMBERS + OUTPUT_NUMBERS + memory_numbers + sum(MAP_NUMBERS[name] for name in scene.maps)
     numbers += CURVED_NUMBERS * (surface is not None)
@@ -135,7 +137,7 @@ def estimate_budget(plan: Plan) -> Budget:
     bytes_per_number = number_bytes + (8 * (2 + (scene.tissue is not None) * 5 / 16) if has_companions else 0)
     return Budget(
         frames=frames,
-        simulation_bytes=round(points * bytes_per_number * numbers) + file_bytes,
+        simulation_bytes=round(points * bytes_per_number * numbers) + surface_bytes,
         drawing_bytes=drawing_bytes(scene) if scene.renders else 0,
         track_bytes=track_bytes,
         picture_bytes=math.ceil(frames * frame_bytes),

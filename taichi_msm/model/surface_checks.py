@@ -76,7 +76,7 @@ def _anisotropy(rest: CurvedRest, kind: str) -> str:
 def isotropy_remedy(rest: CurvedRest, kind: str) -> str:
     """Return the numbers of points with nearly square cells, or the advice for sheared and uneven cells."""
     (p, q), (rows, cols) = rest.cell_sides, (count - 1 for count in rest.position.shape[:2])
-    # Rhombi of more than 60 degrees are isotropic.
+    # Rhombi of 60 to 120 degrees are isotropic.
     if np.median(np.abs(rest.cells.cosine)) <= 0.5 and max(p / q, q / p) >= 1.5:
         finer = (rows, round(cols * p / q)) if p > q else (round(rows * q / p), cols)
         if max(finer) < MAX_POINTS:
@@ -87,7 +87,7 @@ def isotropy_remedy(rest: CurvedRest, kind: str) -> str:
 
 
 def neighbour_angles(normals: Array) -> Array:
-    """Return the larger angle of the normal of a cell to those of the next ones [degrees], shape (rows, cols)."""
+    """Return the larger angle of the normal of each cell to those of the next ones [degrees], one per cell."""
     angles = np.zeros(normals.shape[:2])
     for at, following in ((np.s_[:-1], np.s_[1:]), (np.s_[:, :-1], np.s_[:, 1:])):
         cosine = (normals[at] * normals[following]).sum(axis=-1)

@@ -43,6 +43,9 @@ COARSE_TIP_PHRASE = "which touches few of them"
 # Largest number of mass points that a remedy suggests, as a multiple of the sheet's.
 MAX_POINTS_RATIO = 4
 
+# Largest number of points between mass points at which a tool may meet a curved sheet at rest.
+MAX_POINTS_BETWEEN = 2_000_000
+
 # A grip holds the mass points within this distance of the tip's centre, in radii of the tip.
 GRIP_RADII = 1.5
 
@@ -187,10 +190,12 @@ class SolidTool(Tool):
     def points_between(self, sheet: Sheet, radii: float = 0.5) -> Array | None:
         """Return points of a curved sheet, some radii or a tenth of a cell apart; None for a flat one."""
         rest = rest_of(sheet)
-        return None if rest.is_flat else rest.refined(min(9, int(rest.longest_side / (radii * self.radius))))
+        most = min(9, math.isqrt(MAX_POINTS_BETWEEN // math.prod(sheet.points)) - 1)
+        return None if rest.is_flat else rest.refined(max(0, min(most, int(rest.longest_side / (radii * self.radius)))))
 
     def problems(self, scene: Scene, grid: TimeGrid) -> Iterator[Problem]:
-        key, depth = ("probes", self.probe, "path"), -self.gap(scene.sheet)
+        points = self.points_between(scene.sheet)
+        key, depth = ("probes", self.probe, "path"), -self.gap_at(self.path_at(np.zeros(1))[0], scene.sheet, points)
         if depth > 1e-9 * self.radius:
             remedy = "begin above it, at a greater height"
             if self.axis @ self.direction_at(0.0) < 0:

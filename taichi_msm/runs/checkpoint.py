@@ -125,7 +125,9 @@ def read_manifest(directory: Path) -> tuple[Manifest, Plan]:
             raise FilesError(f"{path} {problem}; run the scene again, or continue with that version") from None
         raise _damaged(path) from None
     plan, problems = try_plan(manifest.scene)
-    if unreadable := [str(problem) for problem in problems if problem.path[-1:] in (("image",), ("file",))]:
+    if unreadable := [
+        str(problem) for problem in problems if problem.path[-1:] == ("image",) or "surface" in problem.path
+    ]:
         raise SceneError(unreadable)
     numbers = () if manifest.estimate is None else asdict(manifest.estimate).values()
     is_valid = manifest.arch in ARCHS and all(number >= 0 for number in numbers)

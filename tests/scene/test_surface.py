@@ -293,13 +293,14 @@ def test_force_on_a_fold(message: Messages) -> None:
     message(force_warnings(made, probe_records(made)), "probes.0")
 
 
-@pytest.mark.parametrize("unit", [True, False], ids=["of points", "of a radius"])
-def test_implausible_units(unit: bool, tmp_path: Path, message: Messages) -> None:
+@pytest.mark.parametrize("kind", ["unit of points", "unit of a radius", "origin"])
+def test_implausible_lengths(kind: str, tmp_path: Path, message: Messages) -> None:
     x, y = np.meshgrid(np.linspace(0, 80, 21), np.linspace(60, 0, 16))
-    np.save(tmp_path / "grid.npy", np.stack([x, y, 0.01 * x**2], axis=-1))
-    points = {"surface": {"points": {"file": str(tmp_path / "grid.npy"), "unit": "m"}}}
+    np.save(tmp_path / "grid.npy", np.stack([x, y, 0.01 * x**2 + 5000 * (kind == "origin")], axis=-1))
+    unit = "m" if kind == "unit of points" else "mm"
+    points = {"surface": {"points": {"file": str(tmp_path / "grid.npy"), "unit": unit}}}
     dome = {"points": [21, 21], "size": [0.1, 0.1], "surface": {"dome": {"radius": 60}}}
-    message(surface_notes(scene_with(points if unit else dome)), "sheet.surface")
+    message(surface_notes(scene_with(dome if kind == "unit of a radius" else points)), "sheet.surface")
 
 
 def test_a_picture_in_few_steps(write: Callable[..., Path]) -> None:
