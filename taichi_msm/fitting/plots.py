@@ -12,7 +12,6 @@ from typing import BinaryIO
 import numpy as np
 from matplotlib import style
 from matplotlib.axes import Axes
-from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.colors import LogNorm, Normalize
 from matplotlib.figure import Figure
 from matplotlib.layout_engine import ConstrainedLayoutEngine
@@ -53,7 +52,6 @@ def _figure(result: FitResult) -> Figure:
     rows = math.ceil(len(panels) / COLUMN_COUNT)
     engine = ConstrainedLayoutEngine(w_pad=0.1, h_pad=0.1)
     figure = Figure(figsize=(TWO_COLUMN_WIDTH, 2.7 * rows + 0.5), dpi=DPI, layout=engine)
-    FigureCanvasAgg(figure)
     figure.suptitle(f"Fit to {printable(result.observations[0].name)}", x=0.01, ha="left", parse_math=False)
     subplots = figure.subplots(rows, COLUMN_COUNT, squeeze=False).ravel()
     for axes, panel in zip(subplots, panels, strict=False):

@@ -178,8 +178,7 @@ def force_warnings(scene: Scene, records: Sequence[ProbeRecord]) -> Iterator[str
     for index, (probe, record) in enumerate(zip(scene.probes, records, strict=True)):
         if probe.moved:
             continue
-        assert probe.vector is not None
-        requested, applied = math.hypot(*probe.vector) if probe.total is not None else 0.0, record["total_force"]
+        requested, applied = math.hypot(*(probe.vector or ())) * (probe.total is not None), record["total_force"]
         if requested > 0 and applied <= MIN_FORCE_RATIO * requested:
             yield (
                 f"probes.{index}: {applied:.3g} N of its {requested:.3g} N reach the sheet; is the tool outside "

@@ -120,6 +120,11 @@ class Tool(ABC):
     def warnings(self, scene: Scene) -> Iterator[str]:
         """Yield warnings of implausible lengths in the path."""
 
+    def _length_warnings(self, noun: str, largest: float, sheet: Sheet) -> Iterator[str]:
+        if largest > (side := rest_of(sheet).extent):
+            fault = f"a {noun} of {largest:g} m, and the sheet is {side:g} m long"
+            yield f"probes.{self.probe}.path: {fault}; {noun}s are in metres"
+
 
 @dataclass(frozen=True, eq=False)
 class SolidTool(Tool):
@@ -163,12 +168,11 @@ class SolidTool(Tool):
         """Return the largest distance of neighbouring mass points at rest that the tool may touch [m]."""
         return rest_of(sheet).longest_side
 
-    def gap(self, sheet: Sheet, t: float = 0.0) -> float:
-        """Return the distance at a time [s] from the sheet at rest [m], negative inside the sheet."""
-        return self.gap_at(self.path_at(np.array([t]))[0], sheet)
-
     def gap_at(self, centre: Array, sheet: Sheet, points: Array | None = None) -> float:
-        """Return the gap [m] with c at a place; on a curved sheet from points, shape (n, 3), or its mass points."""
+        """Return the distance from the sheet at rest [m] with the tip's centre c [m], shape (3,); below 0 inside it.
+
+        On a curved sheet it is that from points [m], shape (n, 3), by default its mass points.
+        """
         if sheet.surface:
             r = (rest_of(sheet).outline if points is None else points) - centre
             depth, *_ = self.shape.build_depth(NUMPY)(*r.T, *self.axis, self.length, self.radius)
@@ -229,12 +233,7 @@ class SolidTool(Tool):
         )
 
     def warnings(self, scene: Scene) -> Iterator[str]:
-        height_max, side = float(np.abs(self.heights).max()), rest_of(scene.sheet).extent
-        if height_max > side:
-            yield (
-                f"probes.{self.probe}.path: a height of {height_max:g} m, and the sheet is {side:g} m long; "
-                "heights are in metres"
-            )
+        yield from self._length_warnings("height", float(np.abs(self.heights).max()), scene.sheet)
 
 
 @dataclass(frozen=True, eq=False)
@@ -331,12 +330,7 @@ class Clamp(Tool):
             yield Problem((*key, "path", 0), text)
 
     def warnings(self, scene: Scene) -> Iterator[str]:
-        distance, side = float(np.linalg.norm(self.path, axis=1).max()), rest_of(scene.sheet).extent
-        if distance > side:
-            yield (
-                f"probes.{self.probe}.path: a displacement of {distance:g} m, and the sheet is {side:g} m long; "
-                "displacements are in metres"
-            )
+        yield from self._length_warnings("displacement", float(np.linalg.norm(self.path, axis=1).max()), scene.sheet)
 
 
 def solid_tools(tools: Sequence[Tool]) -> dict[int, SolidTool]:

@@ -84,9 +84,8 @@ class SpringTerm(Term):
 
     @property
     def constant_places(self) -> Places:
-        return Places(
-            stiffness=3, tension=3, laws=[law_places(self.law)] * 3
-        )  # k - tau, tau and the law of each family
+        # k - tau, tau and the law of each family.
+        return Places(stiffness=3, tension=3, laws=[law_places(self.law)] * 3)
 
     @property
     def field_places(self) -> Places:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
+import numpy as np
 import pytest
 
 from taichi_msm import Simulation
@@ -67,5 +68,5 @@ def test_tool_between_the_mass_points_reaches_the_sheet(height: float, reaches: 
     path = [[0, across, down, 0.002], [1, across, down, height]]
     made = scene([{"path": path, "instrument": needle}])
     (tool,) = solid_tools(make_plan(made).tools).values()
-    assert tool.gap(made.sheet, 1.0) > 1e-3
+    assert tool.gap_at(tool.path_at(np.array([1.0]))[0], made.sheet) > 1e-3
     assert tool.reaches(made) == reaches
