@@ -323,8 +323,8 @@ def choose_points(
     raise SceneError(
         [
             f"{reached}{estimate.error:.2g}, and no sheet has more than {MAX_POINTS} points a side; take a wider tool "
-            "(probes.N.radius, a smaller falloff), where it wrinkles and every side is fixed tissue.pretension, or "
-            "bending of a flat sheet, or a larger tolerance"
+            "(probes.N.radius, a smaller falloff) or a larger tolerance, or prevent wrinkles by tissue.pretension, or "
+            "bending of a flat sheet, with every side fixed"
         ]
     )
 
