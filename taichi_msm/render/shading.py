@@ -367,13 +367,15 @@ def _filter_texture(entry, is_covered, texels: ti.template(), band: ti.template(
                 level += 1
             x = (x + 0.5) / texel_size - 0.5
             y = (y + 0.5) / texel_size - 0.5
-    colour, slope_x, slope_y = _fetch(*fine, x, y, texels, config)
+    colour, slope_x, slope_y = _fetch(fine[0], fine[1], fine[2], x, y, texels, config)
     if ti.static(config.tissue):  # noqa: SIM102  (evaluated at compile time)
         if max_footprint > 1.0:
             # The same position in the next coarser level.
             x = x * 0.5 - 0.25
             y = y * 0.5 - 0.25
-            coarse_colour, coarse_slope_x, coarse_slope_y = _fetch(*coarse, x, y, texels, config)
+            coarse_colour, coarse_slope_x, coarse_slope_y = _fetch(
+                coarse[0], coarse[1], coarse[2], x, y, texels, config
+            )
             coarse_weight = ti.max(ti.min(ti.sqrt(footprint) / texel_size - 1.0, 1.0), 0.0)
             for n in ti.static(range(3)):
                 colour[n] += (coarse_colour[n] - colour[n]) * coarse_weight
