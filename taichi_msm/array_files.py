@@ -93,8 +93,7 @@ def _load(path: str, data: bytes, names: Sequence[str]) -> NDArray[Any]:
 
     if data[:2] != b"PK":
         _require_memory(path, len(data))
-        array: NDArray[Any] = np.load(io.BytesIO(data), allow_pickle=False)
-        return array
+        return np.load(io.BytesIO(data), allow_pickle=False)
     with zipfile.ZipFile(io.BytesIO(data)) as archive:
         members = {info.filename.removesuffix(".npy"): info for info in archive.infolist()}
         name = next((name for name in names if name in members), next(iter(members)) if len(members) == 1 else None)
@@ -106,5 +105,4 @@ def _load(path: str, data: bytes, names: Sequence[str]) -> NDArray[Any]:
             raise PictureError(f"{path}: {name} has {size:,} bytes", f"take at most {MAX_BYTES:,}")
         _require_memory(path, size)
         with archive.open(members[name]) as member:
-            array = np.load(io.BytesIO(member.read(MAX_BYTES)), allow_pickle=False)
-    return array
+            return np.load(io.BytesIO(member.read(MAX_BYTES)), allow_pickle=False)

@@ -107,8 +107,8 @@ def sum_probe_forces(probe: Probe, sheet: Sheet, refinement: int = 1) -> tuple[f
     law, at, rest = probe_force(probe, sheet), control_points(probe, sheet)[1][0], rest_of(sheet)
     force = math.hypot(*law.force)
     if isinstance(rest, CurvedRest):
-        finer = sheet.model_copy(update={"points": tuple((count - 1) * refinement + 1 for count in sheet.points)})
-        fine = rest_of(finer)
+        points = tuple((count - 1) * refinement + 1 for count in sheet.points)
+        fine = rest_of(sheet.model_copy(update={"points": points}))
         assert isinstance(fine, CurvedRest)
         decay, areas = law.decay(fine.distances(at)), fine.areas / rest.cell_area
         forces = decay * areas if law.by_area else decay / refinement**2
