@@ -32,7 +32,16 @@ if TYPE_CHECKING:
     from taichi_msm.scene.camera import Camera, Distortion, Intrinsics, Pose
     from taichi_msm.scene.render import Light, Render
     from taichi_msm.scene.scene import Scene, Time
-    from taichi_msm.scene.sheet import Foundation, RelaxationBranch, Sheet, Springs, Stiffening, StiffnessMap, Tissue
+    from taichi_msm.scene.sheet import (
+        Foundation,
+        RelaxationBranch,
+        Sheet,
+        SheetMask,
+        Springs,
+        Stiffening,
+        StiffnessMap,
+        Tissue,
+    )
     from taichi_msm.scene.surface import Dome, Folds, HeightField, PointGrid, RestSurface, Tube
     from taichi_msm.scene.tools import Instrument, Probe
     from taichi_msm.solver.state import TipForce
@@ -56,7 +65,7 @@ _NAMES = {
     "scene.camera": "Camera Distortion Intrinsics Pose",
     "scene.render": "Light Render",
     "scene.scene": "Scene Time",
-    "scene.sheet": "Foundation RelaxationBranch Sheet Springs Stiffening StiffnessMap Tissue",
+    "scene.sheet": "Foundation RelaxationBranch Sheet SheetMask Springs Stiffening StiffnessMap Tissue",
     "scene.surface": "Dome Folds HeightField PointGrid RestSurface Tube",
     "scene.tools": "Instrument Probe",
     "solver.state": "TipForce",
@@ -66,7 +75,18 @@ _NAMES = {
 
 __all__ = ["ArgumentError", "DeviceError", "DivergedError", "FilesError", "MsmError", "NotInstalledError", "SceneError"]
 __all__ += ["Camera", "Distortion", "Foundation", "Instrument", "Intrinsics", "Light", "Pose", "Probe"]
-__all__ += ["RelaxationBranch", "Render", "Scene", "Sheet", "Springs", "Stiffening", "StiffnessMap", "Time", "Tissue"]
+__all__ += [
+    "RelaxationBranch",
+    "Render",
+    "Scene",
+    "Sheet",
+    "SheetMask",
+    "Springs",
+    "Stiffening",
+    "StiffnessMap",
+    "Time",
+    "Tissue",
+]
 __all__ += ["Dome", "Folds", "HeightField", "PointGrid", "RestSurface", "Tube"]
 __all__ += ["Flow", "Labels", "Outcome", "Playback", "Sight", "Simulation", "Surface", "TipForce"]
 __all__ += ["FitResult", "FittedMap", "Gradient"]

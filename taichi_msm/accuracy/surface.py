@@ -56,13 +56,13 @@ def surface_record(scene: Scene) -> SurfaceRecord | None:
     rest, surface = rest_of(scene.sheet), scene.sheet.surface
     if not isinstance(rest, CurvedRest) or surface is None:
         return None
-    errors, area, file = rest.isotropy_errors, rest.cells.area, surface.file
+    errors, area, file = rest.isotropy_errors, np.where(rest.present, rest.cells.area, 0), surface.file
     return {
         "kind": surface.kind,
         "sha256": file.sha256 if file else None,
         "sides": [rest.shortest_side, rest.longest_side],
         "isotropy_error": {"mean": float((errors * area).sum() / area.sum()), "worst": float(errors.max())},
-        "clamped": int(cell_stiffness(rest.cells, 1.0).is_clamped.sum()),
+        "clamped": int(cell_stiffness(rest.cells, 1.0).is_clamped[rest.present].sum()),
         "filled": 0.0,
     }
 
@@ -92,7 +92,7 @@ def surface_notes(scene: Scene) -> Iterator[str]:
     elif not surface.points and extents[0] < MIN_RISE * extents[2]:
         rise = f"{extents[0]:.2g} m over {extents[2]:.3g} m"
         yield f"sheet.surface: nearly flat, as it rises by {rise}; lengths are in metres"
-    angles = neighbour_angles(rest.cell_normals)
+    angles = neighbour_angles(rest.cell_normals, rest.present)
     if angles.max() > NOTED_ANGLE_DEGREES:
         yield f"sheet.surface: {describe_fold(angles)}; {FOLD_REMEDY}"
 
@@ -102,9 +102,9 @@ def describe_surface(plan: Plan) -> Iterator[str]:
     rest, record = rest_of(plan.scene.sheet), surface_record(plan.scene)
     if not isinstance(rest, CurvedRest) or record is None:
         return
-    cells, (rows, cols) = rest.cells, plan.scene.sheet.points
-    aspect = np.maximum(cells.side_a / cells.side_b, cells.side_b / cells.side_a)
-    angles = np.degrees(np.arccos(cells.cosine))
+    (rows, cols), present = plan.scene.sheet.points, rest.present
+    side_a, side_b = rest.cells.side_a[present], rest.cells.side_b[present]
+    aspect, angles = np.maximum(side_a / side_b, side_b / side_a), np.degrees(np.arccos(rest.cells.cosine[present]))
     low, high = f"{angles.min():.0f}", f"{angles.max():.0f}"
     yield (
         f"surface: {record['kind']}, {rows} x {cols} points, cells of {rest.shortest_side:.3g} to "
@@ -114,9 +114,10 @@ def describe_surface(plan: Plan) -> Iterator[str]:
     if plan.scene.tissue is not None:
         yield _describe_isotropy(rest, record)
     if not plan.scene.time.at_rest:
-        squares = fictitious_masses(plan.material, plan.scene.sheet)
+        present = plan.area_shares > 0
+        squares = fictitious_masses(plan.material, plan.scene.sheet)[present]
         if plan.material.by_area:
-            squares /= plan.area_shares
+            squares /= plan.area_shares[present]
         if (ratio := math.sqrt(float(squares.max() / np.median(squares)))) > 1.05:
             yield f"surface: its smallest or stiffest cells make the step {ratio:.2g} times shorter than median ones"
     if plan.material.is_tense:
@@ -125,8 +126,9 @@ def describe_surface(plan: Plan) -> Iterator[str]:
             pull = family.tension[..., None] * family.offset
             pulls[family.start] += pull
             pulls[family.end] -= pull
-        pressures = np.abs((pulls * rest.point_normals).sum(axis=-1)) / rest.areas
-        largest = float(pressures[~plan.fixed].max(initial=0.0))
+        free = ~plan.fixed
+        pressures = np.abs((pulls * rest.point_normals).sum(axis=-1)[free]) / rest.areas[free]
+        largest = float(pressures.max(initial=0.0))
         yield f"surface: at rest, a pressure of up to {largest:.4g} Pa holds the pretension"
 
 

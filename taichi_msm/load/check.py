@@ -72,7 +72,7 @@ def _check_combinations(scene: Scene, maps: Maps | None, *, with_image: bool) ->
     """Plan a scene, and check combinations of its keys; with `with_image`, also the image file."""
     plan, problems = try_plan(scene, maps)
     # Cameras look at the sheet at rest.
-    if plan is not None or scene.sheet.surface is None:
+    if plan is not None or not (scene.sheet.surface or scene.sheet.mask):
         problems += camera_problems(scene)
     if "mp4" in scene.output and not outputs.is_pyav_installed():
         problems.append(Problem(("output",), outputs.PYAV_NOT_INSTALLED))

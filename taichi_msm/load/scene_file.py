@@ -30,7 +30,8 @@ MAP_KEYS: tuple[Key, ...] = (
     ("tissue", "foundation_map", "image"),
     ("springs", "map", "image"),
 )
-PICTURE_KEYS = (IMAGE_KEY, *MAP_KEYS)
+MASK_KEYS: tuple[Key, ...] = (("sheet", "mask"), ("sheet", "mask", "image"))
+PICTURE_KEYS = (IMAGE_KEY, *MAP_KEYS, *MASK_KEYS)
 
 # Keys of the heights and points of a surface, whose values are paths of arrays, of heights also of pictures.
 SURFACE_KEYS: tuple[Key, ...] = (("sheet", "surface", "height", "file"), ("sheet", "surface", "points", "file"))

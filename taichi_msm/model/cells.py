@@ -16,7 +16,7 @@ rhombus is exactly isotropic, with Poisson's ratio 1/3, unless it is clamped.
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -87,9 +87,9 @@ def isotropy_errors(cells: Cells) -> Array:
     return np.asarray(np.abs(np.linalg.eigvalsh(matrix) - 1).max(axis=-1))
 
 
-def sum_around_points(values: Array) -> Array:
+def sum_around_points(values: NDArray[Any]) -> Array:
     """Sum values of cells around each mass point, shape (rows, cols, ...) from (rows - 1, cols - 1, ...)."""
-    padded = np.pad(values, ((1, 1), (1, 1), *((0, 0),) * (values.ndim - 2)))
+    padded = np.pad(values.astype(float), ((1, 1), (1, 1), *((0, 0),) * (values.ndim - 2)))
     return padded[:-1, :-1] + padded[:-1, 1:] + padded[1:, :-1] + padded[1:, 1:]
 
 

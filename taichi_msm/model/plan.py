@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from taichi_msm.arithmetic import Array
 from taichi_msm.integrators import Coefficients
+from taichi_msm.model.rest import rest_of
 from taichi_msm.model.sheet import Maps, Material, has_fixed_border, point_areas
 from taichi_msm.model.time_grid import TimeGrid
 from taichi_msm.model.tool_force import control_points
@@ -84,7 +85,7 @@ class Plan:
 
     scene: Scene  # as read or built by the user
     maps: Maps  # images of its stiffness maps
-    fixed: NDArray[np.bool_]  # whether each mass point is fixed, shape (rows, cols)
+    fixed: NDArray[np.bool_]  # whether each mass point is fixed or without sheet, shape (rows, cols)
     material: Material  # coefficients of the sheet, with its maps as arrays
     stable_step: float  # largest stable step [s]; infinite without stiffness and damping
     grid: TimeGrid  # frames, steps and precision
@@ -105,7 +106,9 @@ class Plan:
     @property
     def mobility(self) -> Array:
         """Inverse mass of each mass point in units of a cell's, 0 if it is fixed, shape (rows, cols)."""
-        return ~self.fixed / (self.area_shares if self.areas_vary and self.material.by_area else 1.0)
+        if not (self.areas_vary and self.material.by_area):
+            return ~self.fixed / 1.0
+        return ~self.fixed / np.where(self.fixed, 1.0, self.area_shares)
 
     @property
     def areas_vary(self) -> bool:
@@ -114,8 +117,9 @@ class Plan:
 
     @property
     def is_held(self) -> bool:
-        """Whether any mass point is fixed or clamped."""
-        return bool(self.fixed.any()) or bool(clamps(self.tools))
+        """Whether any mass point of the sheet is fixed or clamped."""
+        mask = rest_of(self.scene.sheet).mask
+        return bool((self.fixed if mask is None else self.fixed & mask.points).any()) or bool(clamps(self.tools))
 
     @property
     def has_contact(self) -> bool:

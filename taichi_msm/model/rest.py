@@ -17,7 +17,8 @@ from numpy.typing import NDArray
 
 from taichi_msm.arithmetic import Array
 from taichi_msm.model.cells import Cells, isotropy_errors, sum_around_points, unit
-from taichi_msm.scene.sheet import Sheet
+from taichi_msm.model.mask import Mask
+from taichi_msm.scene.sheet import Sheet, SheetMask
 from taichi_msm.scene.surface import Dome, HeightField, PointGrid, RestSurface, Tube
 
 
@@ -29,15 +30,27 @@ class Rest(ABC):
     """
 
     position: Array  # of the mass points [m], shape (rows, cols, 3), read-only
+    mask: Mask | None  # cells that are sheet; None: all
     cell_area: float  # area of a cell, on a curved sheet the mean [m2]
     cell_sides: tuple[float, float]  # lengths along rows and along columns, on a curved sheet the means [m]
     shortest_side: float  # of the sides of all cells [m]
     longest_side: float
 
+    @property
+    def present(self) -> NDArray[np.bool_]:
+        """Whether each cell is sheet, shape (rows - 1, cols - 1)."""
+        rows, cols = self.position.shape[:2]
+        return np.ones((rows - 1, cols - 1), bool) if self.mask is None else self.mask.cells
+
+    @property
+    def present_positions(self) -> Array:
+        """Positions of the mass points of cells that are sheet [m], shape (n, 3)."""
+        return self.position.reshape(-1, 3) if self.mask is None else self.position[self.mask.points]
+
     @cached_property
     def box(self) -> Array:
         """Lower and upper corner of the sheet's box [m], shape (2, 3)."""
-        return np.stack([self.position.min(axis=(0, 1)), self.position.max(axis=(0, 1))])
+        return np.stack([self.present_positions.min(axis=0), self.present_positions.max(axis=0)])
 
     @property
     def sides(self) -> tuple[float, float]:
@@ -46,9 +59,9 @@ class Rest(ABC):
         return (rows - 1) * self.cell_sides[1], (cols - 1) * self.cell_sides[0]
 
     @property
-    @abstractmethod
-    def outline(self) -> Array:
+    def hull(self) -> Array:
         """Points whose convex hull contains the sheet [m], shape (n, 3)."""
+        return self.present_positions
 
     @property
     def diagonal(self) -> float:
@@ -98,9 +111,9 @@ class Rest(ABC):
 class FlatRest(Rest):
     """A rectangle in the plane z = 0 about the origin."""
 
-    def __init__(self, points: tuple[int, int], size: tuple[float, float]) -> None:
+    def __init__(self, points: tuple[int, int], size: tuple[float, float], mask: Mask | None = None) -> None:
         (rows, cols), (height, width) = points, size
-        self._size = size
+        self._size, self.mask = size, mask
         # x of the columns, shape (cols,), and y of the rows, shape (rows, 1).
         self._axes = (
             (np.arange(cols) / (cols - 1) - 0.5) * width,
@@ -118,8 +131,8 @@ class FlatRest(Rest):
         return self._size
 
     @property
-    def outline(self) -> Array:
-        return self.position[[0, 0, -1, -1], [0, -1, 0, -1]]
+    def hull(self) -> Array:
+        return self.position[[0, 0, -1, -1], [0, -1, 0, -1]] if self.mask is None else self.present_positions
 
     @property
     def diagonal(self) -> float:
@@ -156,28 +169,32 @@ class FlatRest(Rest):
 class CurvedRest(Rest):
     """Mass points anywhere in space."""
 
-    def __init__(self, position: Array) -> None:
-        self.position = position
+    def __init__(self, position: Array, mask: Mask | None = None) -> None:
+        self.position, self.mask = position, mask
         self.position.flags.writeable = False
         self.cells = Cells.of(position)
-        self.cell_area = float(self.cells.area.mean())
-        self.cell_sides = float(self.cells.side_a.mean()), float(self.cells.side_b.mean())
-        sides = np.concatenate([np.linalg.norm(np.diff(position, axis=n), axis=-1).ravel() for n in (0, 1)])
-        self.shortest_side, self.longest_side = float(sides.min()), float(sides.max())
-
-    @property
-    def outline(self) -> Array:
-        return self.position.reshape(-1, 3)
+        present = self.present
+        self.cell_area = float(self.cells.area[present].mean())
+        self.cell_sides = float(self.cells.side_a[present].mean()), float(self.cells.side_b[present].mean())
+        sides = []
+        for axis in (0, 1):  # sides along columns, then along rows, each of the cells on both sides of it
+            padded = np.pad(present, [(0, 0), (1, 1)] if axis == 0 else [(1, 1), (0, 0)])
+            belongs = padded[:, :-1] | padded[:, 1:] if axis == 0 else padded[:-1] | padded[1:]
+            sides.append(np.linalg.norm(np.diff(position, axis=axis), axis=-1)[belongs])
+        self.shortest_side = float(min(each.min() for each in sides))
+        self.longest_side = float(max(each.max() for each in sides))
 
     @cached_property
     def areas(self) -> Array:
         """Area of every mass point [m2], shape (rows, cols)."""
-        return sum_around_points(self.cells.area / 4)
+        return sum_around_points(np.where(self.present, self.cells.area / 4, 0))
 
     @cached_property
     def isotropy_errors(self) -> Array:
-        """Isotropy error of each cell, shape (rows - 1, cols - 1)."""
-        return isotropy_errors(self.cells)
+        """Isotropy error of each cell, 0 without sheet, shape (rows - 1, cols - 1)."""
+        errors = np.zeros(self.present.shape)
+        errors[self.present] = isotropy_errors(Cells(*(values[self.present] for values in self.cells)))
+        return errors
 
     @cached_property
     def cell_normals(self) -> Array:
@@ -186,8 +203,15 @@ class CurvedRest(Rest):
 
     @cached_property
     def point_normals(self) -> Array:
-        """Unit normals at the mass points, along the sum of b x a of their cells, shape (rows, cols, 3)."""
-        return unit(sum_around_points(np.cross(self.cells.b, self.cells.a)))
+        """Unit normals at the mass points, along the sum of b x a of their cells, shape (rows, cols, 3).
+
+        A point without sheet has that of all cells around it.
+        """
+        normals = np.cross(self.cells.b, self.cells.a)
+        if self.mask is None:
+            return unit(sum_around_points(normals))
+        of_sheet, of_all = (sum_around_points(values) for values in (normals * self.present[..., None], normals))
+        return np.nan_to_num(unit(np.where(self.mask.points[..., None], of_sheet, of_all)))
 
     def coordinates(self, fractions: Array) -> Array:
         return np.asarray(fractions, dtype=float)
@@ -220,7 +244,8 @@ class CurvedRest(Rest):
 def rest_of(sheet: Sheet) -> Rest:
     """Return the sheet at rest; a PictureError if the file of its surface cannot be used."""
     file = sheet.surface.file if sheet.surface else None
-    return _rest(sheet.points, sheet.size, sheet.surface, file.sha256 if file else "")
+    mask = sheet.mask.pixels.sha256 if sheet.mask else ""
+    return _rest(sheet.points, sheet.size, sheet.surface, sheet.mask, (file.sha256 if file else "", mask))
 
 
 def rest_normals(sheet: Sheet) -> Array:
@@ -240,10 +265,14 @@ def _rest(
     points: tuple[int, int],
     size: tuple[float, float],
     surface: RestSurface | None,
-    sha256: str,  # noqa: ARG001  # of its file, part of the key of the cache
+    mask: SheetMask | None,
+    sha256: tuple[str, str],  # noqa: ARG001  # of the files, part of the key of the cache
 ) -> Rest:
-    flat = FlatRest(points, size)
-    return CurvedRest(KINDS[surface.kind](getattr(surface, surface.kind), flat.position)) if surface else flat
+    sampled = None if mask is None else Mask.at_cells(mask.pixels.is_sheet, points)
+    flat = FlatRest(points, size, sampled)
+    if surface is None:
+        return flat
+    return CurvedRest(KINDS[surface.kind](getattr(surface, surface.kind), flat.position), sampled)
 
 
 def _height_positions(field: HeightField, flat: Array) -> Array:

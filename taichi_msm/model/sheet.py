@@ -58,21 +58,27 @@ def rest_positions(sheet: Sheet) -> NDArray[np.float64]:
 
 
 def fixed_points(sheet: Sheet) -> NDArray[np.bool_]:
-    """Return whether each mass point is fixed, shape (rows, cols)."""
-    fixed = np.zeros(sheet.points, dtype=bool)
+    """Return whether each mass point is fixed, shape (rows, cols); one without a cell of the sheet is."""
+    fixed, mask = np.zeros(sheet.points, dtype=bool), rest_of(sheet).mask
     if sheet.fixed == "corners":
         fixed[np.ix_((0, -1), (0, -1))] = True
-        return fixed
     for side in fixed_sides(sheet):
         fixed[SIDES[side]] = True
+    if mask is not None:
+        fixed |= ~(mask.inner_points if fixes_outline(sheet) else mask.points)
     return fixed
+
+
+def fixes_outline(sheet: Sheet) -> bool:
+    """Return whether all mass points of fewer than four cells are fixed."""
+    return "outline" in sheet.fixed
 
 
 def fixed_sides(sheet: Sheet) -> tuple[Side, ...]:
     """Return the sides whose mass points are all fixed."""
-    if isinstance(sheet.fixed, str):
-        return tuple(SIDES) if sheet.fixed == "border" else ()
-    return sheet.fixed
+    if sheet.fixed == "border" or fixes_outline(sheet):
+        return tuple(SIDES)
+    return tuple(side for side in SIDES if side in sheet.fixed)
 
 
 def _held_points(scene: Scene, fixed: NDArray[np.bool_]) -> NDArray[np.bool_]:
@@ -178,7 +184,7 @@ def largest_mean(factors: Array) -> float:
 
 
 def area_shares(sheet: Sheet) -> Array:
-    """Return the share of a cell's area at each mass point: 1, at edges 1/2, at corners 1/4; shape (rows, cols)."""
+    """Return the share of a cell's area at each point of a whole rectangle: 1, at edges 1/2, at corners 1/4."""
     rows, cols = np.ones(sheet.points[0]), np.ones(sheet.points[1])
     rows[[0, -1]], cols[[0, -1]] = 0.5, 0.5
     return np.outer(rows, cols)
@@ -204,6 +210,8 @@ def material_key_problems(scene: Scene) -> Iterator[Problem]:
     """Report missing and superfluous keys of springs and tissue."""
     sheet = scene.sheet
     if scene.tissue is None:
+        if sheet.mask is not None:
+            yield Problem(("sheet", "mask"), "needs tissue, whose edges are softer; remove mask, or set tissue")
         if scene.springs is None:
             text = "missing; expected a mapping with young, thickness and density, or springs in its place"
             yield Problem(("tissue",), text)
@@ -259,14 +267,17 @@ def tissue_problems(scene: Scene, fixed: NDArray[np.bool_], factors: Array | Non
     if tissue.relaxation and tissue.foundation_stiffness and tissue.foundation_active == "loaded":
         text = "loaded, but tissue that relaxes needs a foundation at all times; set foundation_active: always"
         yield Problem(("tissue", "foundation_active"), text)
-    if not has_fixed_border(_held_points(scene, fixed)):
+    needed, remedy = "every side fixed or clamped", "border"
+    if sheet.mask is not None:
+        needed, remedy = "the outline fixed where a mask is", "outline"
+    if not (has_fixed_border(_held_points(scene, fixed)) if sheet.mask is None else fixes_outline(sheet)):
         bending = "plate" if tissue.bending == "plate" else f"{tissue.bending:g} N m"
         for name, value in (("pretension", f"{tissue.pretension:g} N/m"), ("bending", bending)):
             if getattr(tissue, name) != 0:
-                text = f"{value} needs every side fixed or clamped; set sheet.fixed: border, or {name}: 0"
+                text = f"{value} needs {needed}; set sheet.fixed: {remedy}, or {name}: 0"
                 yield Problem(("tissue", name), text)
     if tissue.pretension > 0:
-        softest = 1.0 if factors is None else float(factors.min())
+        softest = 1.0 if factors is None else float(factors[rest_of(sheet).present].min())
         max_pretension = 1.5 * tissue.young * tissue.thickness * softest
         if tissue.pretension >= max_pretension:
             yield Problem(

@@ -46,10 +46,10 @@ def surface_problems(scene: Scene) -> Iterator[Problem]:
 def _fold(rest: CurvedRest, scene: Scene) -> str:
     """Return the fault of a cell without area, or turned over relative to a neighbour; empty without one."""
     normals, cells = rest.cell_normals, rest.cells
-    has_area = cells.area > MIN_SINE * cells.side_a * cells.side_b
+    has_area = (cells.area > MIN_SINE * cells.side_a * cells.side_b) | ~rest.present
     if not has_area.all():
         return f"the cell at {describe_largest(~has_area)} has no area; its corners must not be on a line"
-    if (angle := neighbour_angles(normals)).max(initial=0.0) > 90:
+    if (angle := neighbour_angles(normals, rest.present)).max(initial=0.0) > 90:
         rise, remedy = float(np.ptp(rest.position[..., 2])), FOLD_REMEDY
         if scene.sheet.surface and scene.sheet.surface.height and rise > max(scene.sheet.size):
             remedy = f"heights are in metres, and rise by {rise:.3g} m"
@@ -63,13 +63,13 @@ def describe_fold(angles: Array) -> str:
 
 
 def _anisotropy(rest: CurvedRest, kind: str) -> str:
-    errors, area = rest.isotropy_errors, rest.cells.area
+    errors, area = rest.isotropy_errors[rest.present], rest.cells.area[rest.present]
     share = float(area[errors > MAX_ISOTROPY_ERROR].sum() / area.sum())
     if share <= MAX_COARSE_SHARE:
         return ""
     return (
         f"{share:.0%} of the area is in cells with an isotropy error above {MAX_ISOTROPY_ERROR:g}, up to "
-        f"{errors.max():.3g} at {describe_largest(errors)}; {isotropy_remedy(rest, kind)}"
+        f"{errors.max():.3g} at {describe_largest(rest.isotropy_errors)}; {isotropy_remedy(rest, kind)}"
     )
 
 
@@ -77,7 +77,7 @@ def isotropy_remedy(rest: CurvedRest, kind: str) -> str:
     """Return the numbers of points with nearly square cells, or the advice for sheared and uneven cells."""
     (p, q), (rows, cols) = rest.cell_sides, (count - 1 for count in rest.position.shape[:2])
     # Rhombi of 60 to 120 degrees are isotropic.
-    if np.median(np.abs(rest.cells.cosine)) <= 0.5 and max(p / q, q / p) >= 1.5:
+    if np.median(np.abs(rest.cells.cosine[rest.present])) <= 0.5 and max(p / q, q / p) >= 1.5:
         finer = (rows, round(cols * p / q)) if p > q else (round(rows * q / p), cols)
         if max(finer) < MAX_POINTS:
             return f"try sheet.points: {[count + 1 for count in finer]}, with nearly square cells"
@@ -86,11 +86,12 @@ def isotropy_remedy(rest: CurvedRest, kind: str) -> str:
     return "take a less steep surface, on which cells are sheared and stretched less"
 
 
-def neighbour_angles(normals: Array) -> Array:
-    """Return the larger angle of the normal of each cell to those of the next ones [degrees], one per cell."""
+def neighbour_angles(normals: Array, present: NDArray[np.bool_]) -> Array:
+    """Return the larger angle of the normal of each cell to those of the next ones [degrees], 0 without sheet."""
     angles = np.zeros(normals.shape[:2])
     for at, following in ((np.s_[:-1], np.s_[1:]), (np.s_[:, :-1], np.s_[:, 1:])):
         cosine = (normals[at] * normals[following]).sum(axis=-1)
+        cosine = np.where(present[at] & present[following], cosine, 1)
         angles[at] = np.maximum(angles[at], np.degrees(np.arccos(np.clip(cosine, -1, 1))))
     return angles
 

@@ -174,7 +174,7 @@ class SolidTool(Tool):
         On a curved sheet it is that from points [m], shape (n, 3), by default its mass points.
         """
         if sheet.surface:
-            r = (rest_of(sheet).outline if points is None else points) - centre
+            r = (rest_of(sheet).hull if points is None else points) - centre
             depth, *_ = self.shape.build_depth(NUMPY)(*r.T, *self.axis, self.length, self.radius)
             return -float(depth.max())
         half = np.array([sheet.size[1] / 2, sheet.size[0] / 2, 0.0])

@@ -500,7 +500,7 @@ def _oblique(scene: Scene) -> Camera:
     """Return the preset oblique: the sheet at rest fits into the picture, with a margin of 4 % in distance."""
     rest, (width_px, height_px) = rest_of(scene.sheet), scene.render.size
     middle = rest.box.mean(axis=0)
-    corners = (rest.outline - middle) @ OBLIQUE_AXES.T
+    corners = (rest.hull - middle) @ OBLIQUE_AXES.T
     half_height = np.tan(np.radians(OBLIQUE_FOV) / 2)
     half = np.array([half_height * width_px / height_px, half_height])
     distance = float((corners[:, 2:] + np.abs(corners[:, :2]) / half).max()) * 1.04

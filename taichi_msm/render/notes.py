@@ -105,7 +105,7 @@ def _invisible_sheet(scene: Scene) -> Iterator[str]:
 def _is_visible(camera: View, pixels: NDArray[np.float64], scene: Scene) -> bool:
     """Return whether any of the pixels [px], shape (..., 2), shows the sheet at rest, or a point of a curved one."""
     if scene.sheet.surface:
-        at = camera.pixels(rest_of(scene.sheet).outline)
+        at = camera.pixels(rest_of(scene.sheet).hull)
         is_inside = ((at > 0) & (at < camera.size)).all(axis=1)
         return bool(is_inside.any()) and bool((np.ptp(at[is_inside], axis=0) > camera.size / 100).any())
     try:

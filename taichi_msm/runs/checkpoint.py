@@ -146,14 +146,16 @@ def is_unfinished(directory: Path) -> bool:
 
 
 def input_digests(plan: Plan) -> dict[str, str]:
-    """Compute the SHA-256 of picture, map and camera files, by scene key.
+    """Compute the SHA-256 of picture, map, surface, mask and camera files, by scene key.
 
-    An unreadable picture is omitted. Digests of maps and cameras come from the plan, which read the files.
+    An unreadable picture is omitted. All digests but that of the picture come from the plan, which read the files.
     """
     scene = plan.scene
     sha256 = {**plan.sha256} | {f"{scene.kind}.{name}.image": image.sha256 for name, image in plan.maps.items()}
     if scene.sheet.surface and (file := scene.sheet.surface.file):
         sha256[".".join(("sheet", "surface", *scene.sheet.surface.file_key))] = file.sha256
+    if scene.sheet.mask:
+        sha256["sheet.mask.image"] = scene.sheet.mask.pixels.sha256
     if scene.image is not None:
         with suppress(PictureError):
             sha256["image"] = file_sha256(scene.image)

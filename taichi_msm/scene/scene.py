@@ -196,22 +196,18 @@ class Scene(Section):
 
     @property
     def pictures(self) -> dict[str, str]:
-        """Paths of the image, the maps and the surface, by dotted key, such as image and tissue.map.image."""
+        """Paths of the image, the maps, surface and mask, by dotted key, such as image and tissue.map.image."""
         image = {} if self.image is None else {"image": self.image}
-        surface, files = self.sheet.surface, {}
-        if surface and surface.file_key:
-            files[".".join(("sheet", "surface", *surface.file_key))] = surface.path
-        return image | files | {f"{self.kind}.{name}.image": value.image for name, value in self.maps.items()}
+        maps = {f"{self.kind}.{name}.image": value.image for name, value in self.maps.items()}
+        return image | self.sheet.files | maps
 
     def with_pictures(self, path: Callable[[str], str]) -> Scene:
-        """Return a copy with the path p of the image, of each map and of the surface replaced by `path(p)`."""
+        """Return a copy with the path p of the image, of each map, of surface and mask replaced by `path(p)`."""
         maps = {name: value.model_copy(update={"image": path(value.image)}) for name, value in self.maps.items()}
         image = None if self.image is None else path(self.image)
         material = self.tissue or self.springs
         changed = None if material is None else material.model_copy(update=maps)
-        surface = self.sheet.surface
-        sheet = self.sheet.model_copy(update={"surface": surface.with_path(path)}) if surface else self.sheet
-        return self.model_copy(update={"image": image, self.kind: changed, "sheet": sheet})
+        return self.model_copy(update={"image": image, self.kind: changed, "sheet": self.sheet.with_files(path)})
 
     @model_validator(mode="after")
     def _check_image_given(self) -> Scene:

@@ -3,15 +3,18 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Collection, Mapping
-from typing import Annotated, Any, Literal
+from collections.abc import Callable, Collection, Mapping
+from dataclasses import dataclass
+from functools import cached_property
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from pydantic import ConfigDict, Field, ValidationError, model_validator
 from typing_extensions import Self
 
-from taichi_msm.images import PictureError
+from taichi_msm.images import PictureError, file_sha256, read_grey
 from taichi_msm.laws.locking import Locking
 from taichi_msm.scene.section import (
+    MAX_PATH,
     MAX_POINTS,
     MAX_TOLERANCE,
     MIN_TOLERANCE,
@@ -22,21 +25,70 @@ from taichi_msm.scene.section import (
     OpenUnitInterval,
     Positive,
     Section,
-    Side,
     Tolerance,
     key,
     scene_fault,
 )
 from taichi_msm.scene.surface import PointGrid, RestSurface
 
+if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
+
+
+# Edges that can be fixed.
+Edge = Literal["top", "bottom", "left", "right", "outline"]
+
+
+@dataclass(frozen=True, eq=False)
+class MaskPixels:
+    """Pixels of a mask, compared by identity, as arrays have no one ==."""
+
+    is_sheet: NDArray[np.bool_]  # shape (height, width)
+    sha256: str  # of the file
+
+
+class SheetMask(Section):
+    """Picture of the parts of the rectangle that are sheet; in a scene its path stands for a mapping with image."""
+
+    image: FilePath = key(
+        ...,
+        "path of a picture, white where there is sheet; relative to the scene file, in its folder or below",
+        "the path of a picture",
+    )
+    invert: bool = key(False, "whether black is sheet instead of white", "true or false")
+
+    @model_validator(mode="before")
+    @classmethod
+    def _accept_path(cls, data: Any) -> Any:
+        if not isinstance(data, str):
+            return data
+        if not 0 < len(data) <= MAX_PATH:
+            raise scene_fault("expected the path of a picture, or a mapping with image and invert")
+        return {"image": data}
+
+    @cached_property
+    def pixels(self) -> MaskPixels:
+        """Pixels, read once; a PictureError if the file cannot be used."""
+        sha256 = file_sha256(self.image)
+        grey = read_grey(self.image, sha256)
+        # White is 128 and more, of 16 bits 32768.
+        return MaskPixels((grey >> (8 * grey.dtype.itemsize - 1) == 1) != self.invert, sha256)
+
+
+def _complete_schema(schema: dict[str, Any]) -> None:
+    """Add to the schema of a sheet what its validators allow.
+
+    With surface.points, the size is not allowed, and the number of points is that of the file by default.
+    """
+    schema |= {"required": [], "anyOf": [{"required": ["points", "size"]}, {"required": ["surface"]}]}
+    schema["properties"]["mask"]["anyOf"].insert(0, {"type": "string", "minLength": 1, "maxLength": MAX_PATH})
+
 
 class Sheet(Section):
     """Sheet of mass points."""
 
-    # With surface.points, the size is not allowed, and the number of points is that of the file by default.
-    model_config = ConfigDict(
-        json_schema_extra={"required": [], "anyOf": [{"required": ["points", "size"]}, {"required": ["surface"]}]}
-    )
+    model_config = ConfigDict(json_schema_extra=_complete_schema)
 
     points: tuple[NodeCount, NodeCount] = key(
         ...,
@@ -57,8 +109,20 @@ class Sheet(Section):
         "mass of a mass point [kg]; required with springs unless motion is quasistatic",
         "a number above 0, in kg",
     )
-    fixed: Literal["border", "corners", "none"] | tuple[Side, ...] = key(
-        "border", "the mass points that never move", "border, corners, none, or a list of top, bottom, left, right"
+    fixed: (
+        Literal["border", "outline", "corners", "none"]
+        | tuple[Literal["top", "bottom", "left", "right", "outline"], ...]
+    ) = key(
+        "border",
+        "the mass points that never move; border and sides are those of the rectangle, outline all points of fewer "
+        "than four cells",
+        "border, outline, corners, none, or a list of top, bottom, left, right, outline",
+    )
+    mask: SheetMask | None = key(
+        None,
+        "with tissue: picture of the parts of the rectangle that are sheet, white where there is sheet; the path of "
+        "the picture, or a mapping to invert it",
+        "the path of a picture, or a mapping with image and invert",
     )
     tolerance: Tolerance | None = key(
         None,
@@ -112,7 +176,24 @@ class Sheet(Section):
         return self
 
     def _unused_keys(self) -> Collection[str]:
-        return ("size",) if self.surface and self.surface.points else () if self.surface else ("surface",)
+        unused = ("size",) if self.surface and self.surface.points else () if self.surface else ("surface",)
+        return unused if self.mask else (*unused, "mask")
+
+    @property
+    def files(self) -> dict[str, str]:
+        """Paths of the files of surface and mask, by dotted key of the scene."""
+        surface, mask = self.surface, self.mask
+        files = {".".join(("sheet", "surface", *surface.file_key)): surface.path} if surface and surface.path else {}
+        return files | ({"sheet.mask.image": mask.image} if mask else {})
+
+    def with_files(self, path: Callable[[str], str]) -> Sheet:
+        """Return a copy with the path p of each file of surface and mask replaced by `path(p)`."""
+        changes: dict[str, Any] = {}
+        if self.surface:
+            changes["surface"] = self.surface.with_path(path)
+        if self.mask:
+            changes["mask"] = self.mask.model_copy(update={"image": path(self.mask.image)})
+        return self.model_copy(update=changes) if changes else self
 
     @property
     def unit_hint(self) -> str:

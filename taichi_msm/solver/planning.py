@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 from taichi_msm.errors import ArgumentError, Problem, SceneError
 from taichi_msm.images import PictureError
 from taichi_msm.integrators import INTEGRATORS
+from taichi_msm.model.mask_checks import mask_problems
 from taichi_msm.model.plan import Plan, build_slots
 from taichi_msm.model.rest import rest_of
 from taichi_msm.model.sheet import (
@@ -130,7 +131,7 @@ def try_plan(scene: Scene, maps: Maps | None = None) -> tuple[Plan | None, list[
     The keys of the scene are valid; checks across keys may fail. By default its stiffness maps are read from their
     files.
     """
-    problems = [*material_key_problems(scene), *surface_problems(scene)]
+    problems = [*material_key_problems(scene), *(list(mask_problems(scene)) or surface_problems(scene))]
     if problems:
         return None, problems
     if maps is None:

@@ -23,7 +23,7 @@ from taichi_msm.terms.contact import ContactTerm
 from taichi_msm.terms.damping import DampingTerm
 from taichi_msm.terms.foundation import FoundationTerm
 from taichi_msm.terms.loads import ProbeTerm
-from taichi_msm.terms.springs import SpringTerm, curved_springs
+from taichi_msm.terms.springs import SpringTerm, assemble_springs, curved_springs
 from taichi_msm.terms.viscoelasticity import ViscoelasticTerm
 
 # All terms, in the order of summation, on which the last bits of results depend.
@@ -59,11 +59,13 @@ def derive_material(scene: Scene, maps: Maps) -> Material:
         virtual_factors=factors.get("foundation_map"),
         **derived,
     )
-    if not isinstance(rest, CurvedRest):
-        return material
-    membrane = scene.tissue.young * scene.tissue.thickness if scene.tissue else 0.0
-    springs = curved_springs(material, scene.sheet, rest, membrane)
-    return replace(material, springs=springs, shares=rest.areas / rest.cell_area)
+    if isinstance(rest, CurvedRest):
+        membrane = scene.tissue.young * scene.tissue.thickness if scene.tissue else 0.0
+        springs = curved_springs(material, scene.sheet, rest, membrane)
+        return replace(material, springs=springs, shares=rest.areas / rest.cell_area)
+    if rest.mask is not None:
+        return replace(material, springs=assemble_springs(material, scene.sheet), shares=rest.mask.cell_counts / 4)
+    return material
 
 
 def build_terms(plan: Plan) -> tuple[Term, ...]:
@@ -79,16 +81,17 @@ def memory_names(plan: Plan) -> tuple[str, ...]:
 def fictitious_masses(material: Material, sheet: Sheet) -> NDArray[np.float64]:
     """Compute fictitious masses of the mass points, shape (rows, cols) [N/m].
 
-    In their dimensionless time every angular frequency of the sheet is at most 1.
+    In their dimensionless time every angular frequency of the sheet is at most 1. Points without sheet have any mass.
     """
-    return np.sum(
-        [np.broadcast_to(term.node_stiffness_bounds(material, sheet), sheet.points) for term in TERMS], axis=0
-    )
+    bounds = [np.broadcast_to(term.node_stiffness_bounds(material, sheet), sheet.points) for term in TERMS]
+    masses, mask = np.asarray(np.sum(bounds, axis=0)), rest_of(sheet).mask
+    return masses if mask is None else np.where(mask.points, masses, masses.max())
 
 
 def highest_frequency(material: Material, sheet: Sheet) -> float:
     """Return an upper bound of the angular frequencies [rad/s], valid while springs exceed half their rest length."""
     if material.shares is None and material.springs is None:
         return math.sqrt(sum(term.stiffness_bound(material, sheet) for term in TERMS) / material.mass)
-    shares = point_areas(material, sheet) if material.by_area else 1.0
-    return math.sqrt(float((fictitious_masses(material, sheet) / shares).max()) / material.mass)
+    shares = point_areas(material, sheet) if material.by_area else np.ones(sheet.points)
+    present = shares > 0
+    return math.sqrt(float((fictitious_masses(material, sheet)[present] / shares[present]).max()) / material.mass)

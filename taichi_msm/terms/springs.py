@@ -32,7 +32,7 @@ from taichi_msm.laws import law_of
 from taichi_msm.laws.law import Law
 from taichi_msm.model.cells import CellStiffness, cell_stiffness, sum_around_points
 from taichi_msm.model.plan import Plan
-from taichi_msm.model.rest import CurvedRest
+from taichi_msm.model.rest import CurvedRest, rest_of
 from taichi_msm.model.sheet import Material, Springs, largest_mean, spacing
 from taichi_msm.scene.scene import Scene
 from taichi_msm.scene.sheet import Sheet
@@ -544,7 +544,7 @@ def assemble_springs(material: Material, sheet: Sheet) -> Springs:
         return material.springs
     along_rows, along_columns, diagonals = spring_stiffness(material, _factors(material, sheet))
     # The tension at rest does not depend on the map.
-    unmapped = np.ones([count - 1 for count in sheet.points])
+    unmapped = rest_of(sheet).present.astype(float)
     tensions = [k * material.tension for k in spring_stiffness(material, unmapped)]
     stiffness = along_rows, along_columns, diagonals, diagonals
     bounds = np.asarray(SpringTerm.node_stiffness_bounds(material, sheet)) / _steepest(material)
@@ -563,8 +563,14 @@ def curved_springs(material: Material, sheet: Sheet, rest: CurvedRest, membrane:
         families = *_sum_beside(cell.along_a, cell.along_b), cell.falling, cell.rising
         return [k * square for k, square in zip(families, squares, strict=True)]
 
-    cell = cell_stiffness(rest.cells, membrane * _factors(material, sheet))
-    stiffness, unmapped = stiffness_of(cell), stiffness_of(cell_stiffness(rest.cells, membrane))
+    def cells_of(factors: NDArray[Any]) -> CellStiffness:
+        # Cells without sheet may have any shape.
+        with np.errstate(divide="ignore", invalid="ignore"):
+            values = cell_stiffness(rest.cells, membrane * factors)
+        return CellStiffness(*(np.where(rest.present, each, 0) for each in values))
+
+    cell, ones = cells_of(_factors(material, sheet)), np.ones(rest.present.shape)
+    stiffness, unmapped = stiffness_of(cell), stiffness_of(cells_of(ones))
     # Bound of each cell from its stiffness alone: k_a and k_b of its longer sides, k_m and k_n of its diagonals.
     k_a = cell.along_a * np.maximum(squares[ALONG_ROW][:-1], squares[ALONG_ROW][1:])
     k_b = cell.along_b * np.maximum(squares[ALONG_COLUMN][:, :-1], squares[ALONG_COLUMN][:, 1:])
@@ -580,8 +586,9 @@ def _sum_beside(along_rows: NDArray[Any], along_columns: NDArray[Any]) -> tuple[
 
 
 def _factors(material: Material, sheet: Sheet) -> NDArray[Any]:
-    """Return the factors of the cells of a sheet, shape (rows - 1, cols - 1)."""
-    return np.ones([count - 1 for count in sheet.points]) if material.factors is None else material.factors
+    """Return the factors of the cells of a sheet, 0 without sheet, shape (rows - 1, cols - 1)."""
+    present = rest_of(sheet).present
+    return present.astype(float) if material.factors is None else np.where(present, material.factors, 0)
 
 
 def spring_stiffness(material: Material, factors: NDArray[Any]) -> tuple[NDArray[Any], NDArray[Any], NDArray[Any]]:
