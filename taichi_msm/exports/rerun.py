@@ -24,6 +24,8 @@ from uuid import NAMESPACE_URL, uuid5
 import numpy as np
 from numpy.typing import NDArray
 
+from taichi_msm.cameras.extrinsics import OPENCV_SIGNS
+from taichi_msm.cameras.view import View
 from taichi_msm.errors import NotInstalledError, ProgressCallback
 from taichi_msm.exports.formats import FORMATS, one_path_per_run
 from taichi_msm.exports.inputs import (
@@ -36,7 +38,7 @@ from taichi_msm.exports.inputs import (
     unit_normals,
 )
 from taichi_msm.model.surface import place_instruments, refine_surface
-from taichi_msm.render.camera import OPENCV_SIGNS, View, calibration, is_moving, view_at
+from taichi_msm.render.camera import calibration, is_moving, view_at
 from taichi_msm.render.labels import NO_FLOW
 from taichi_msm.render.texture import load_texture
 from taichi_msm.runs.finished import FinishedRun

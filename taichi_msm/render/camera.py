@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from bisect import bisect_left, bisect_right
+from bisect import bisect_left
 from collections.abc import Iterator, Sequence
 from typing import Any, NamedTuple
 
@@ -11,14 +11,21 @@ import numpy as np
 from numpy.typing import NDArray
 
 from taichi_msm.arithmetic import Array
+from taichi_msm.cameras.extrinsics import (
+    OPENCV_SIGNS,
+    extrinsics,
+    interpolate_keyframes,
+    look_at_axes,
+    normalised,
+)
+from taichi_msm.cameras.lens import IDENTITY_LENS
+from taichi_msm.cameras.view import View, companion_view, pinhole_view
 from taichi_msm.errors import Key, Problem, SceneError
 from taichi_msm.lenses.model import MAX_RADIUS
 from taichi_msm.model.rest import rest_of
 from taichi_msm.model.surface import Solid
-from taichi_msm.render.lens import IDENTITY_LENS, Lens
 from taichi_msm.scene.camera import Camera
 from taichi_msm.scene.outputs import OUTPUTS
-from taichi_msm.scene.render import AnyCamera
 from taichi_msm.scene.scene import Scene
 from taichi_msm.scene.section import FRAME_TOLERANCE, MAX_SUPERSAMPLE, MIN_MAGNITUDE
 
@@ -27,90 +34,6 @@ OBLIQUE_FOV = 32.0
 
 # Maximum baseline of a stereo pair, in units of the sheet's larger side.
 MAX_BASELINE_RATIO = 1e6
-
-# Signs that convert the axes right, up, toward the camera to OpenCV's right, down, forward.
-OPENCV_SIGNS = np.array([[1.0], [-1.0], [-1.0]])
-
-
-class View(NamedTuple):
-    """Resolved camera: the map from the world to pixels.
-
-    A point in the camera's frame is (right, up, -depth) [m] from the eye. Without lens distortion its pixel is
-
-        x = centre_x + right / w scale_x,    y = centre_y - up / w scale_y    [px]
-
-    from the upper left corner, where w is the depth for a pinhole camera, and 1 for the orthographic one. Lens
-    distortion maps these pixels to those of the picture.
-    """
-
-    matrix: Array  # maps (x, y, z, 1) [m] to (X, Y, w, depth) with x = X / w, y = Y / w, shape (4, 4)
-    near: float  # near plane [m]; only surfaces with a larger w are drawn
-    axes: Array  # unit vectors right, up and toward the camera, as rows, shape (3, 3)
-    eye: Array  # origin of the camera's frame and of depth [m], shape (3,)
-    scale: Array  # pixels per metre at w = 1, horizontal and vertical, shape (2,)
-    centre: Array  # principal point [px], shape (2,)
-    size: Array  # width and height of the picture [px], shape (2,)
-    distance: float  # from the eye to the target, at the start [m]
-    pinhole: bool  # whether the projection is perspective
-    lens: Lens | None = None
-    baseline: float = 0.0  # distance to the companion along the x axis [m]; 0 unless the cameras are parallel
-    companion: View | None = None  # right camera of a stereo pair, of which this is the left one
-    light_view: View | None = None  # camera that carries the light; None if it is this camera
-
-    @property
-    def lens_model(self) -> str:
-        """Name of the lens model; empty without lens distortion."""
-        return "" if self.lens is None else self.lens.model
-
-    @property
-    def optics(self) -> tuple[object, ...]:
-        """Parameters that determine the undistortion map, as a cache key; empty without lens distortion."""
-        return () if self.lens is None else (self.lens, *self.scale, *self.centre)
-
-    def project(self, points: Array) -> Array:
-        """Map points [m], shape (..., 3), to (X, Y, w, depth) without lens distortion, shape (..., 4)."""
-        return points @ self.matrix[:, :3].T + self.matrix[:, 3]
-
-    def pixels(self, points: Array) -> Array:
-        """Project points [m], shape (..., 3), to distorted pixels [px], shape (..., 2).
-
-        The pixels are NaN behind the near plane and beyond the limit of the lens.
-        """
-        x, y, w, _ = np.moveaxis(self.project(points), -1, 0)
-        w = np.where(w > self.near, w, np.nan)
-        return self.distort(np.stack([x / w, y / w], axis=-1))
-
-    def points(self, pixels: Array, depth: Array) -> Array:
-        """Return the points [m], shape (n, 3), at undistorted pixels [px], shape (n, 2), and depths [m], shape (n,)."""
-        right, down = ((pixels - self.centre) / self.scale * (depth[:, None] if self.pinhole else 1.0)).T
-        return self.eye + np.stack([right, -down, -depth], axis=-1) @ self.axes
-
-    def distort(self, pixels: Array) -> Array:
-        """Return distorted pixels [px], shape (..., 2); NaN beyond the limit of the lens."""
-        if self.lens is None:
-            return pixels
-        points = (pixels - self.centre) / self.scale
-        # This comparison also excludes NaN.
-        within = np.linalg.norm(points, axis=-1, keepdims=True) < self.lens.limit
-        return self.centre + self.scale * self.lens.distort(np.where(within, points, np.nan))
-
-    def undistort(self, pixels: Array) -> Array:
-        """Invert `distort`, accurate to 1e-6 px; NaN where the lens has no line of sight."""
-        if self.lens is None:
-            return pixels
-        return self.centre + self.scale * self.lens.undistort((pixels - self.centre) / self.scale)
-
-    def disparity(self, depth: NDArray[np.float32]) -> NDArray[np.float32]:
-        """Return the disparity to the companion camera [px], 0 at depth 0; for cameras without lens distortion."""
-        w = np.where(depth == 0, np.inf, depth if self.pinhole else 1.0)
-        return (self.scale[0] * self.baseline / w).astype(np.float32)
-
-    def centred_at(self, pixel: tuple[float, float]) -> View:
-        """Return a copy with X = Y = 0 along the line of sight of the centre of a pixel, (column, row) from (0, 0)."""
-        matrix, centre = self.matrix.copy(), self.undistort(np.array(pixel) + 0.5)
-        for row in (0, 1):
-            matrix[row] -= centre[row] * matrix[2]
-        return self._replace(matrix=matrix)
 
 
 class Shot(NamedTuple):
@@ -174,7 +97,7 @@ def _view_of(scene: Scene, time: float, name: str) -> View:
     if camera == "top":
         result = _top(scene)
     elif isinstance(camera, Camera) and camera.beside is not None:
-        result = _companion(camera, scene, _view_of(scene, time, camera.beside))
+        result = companion_view(camera, _view_of(scene, time, camera.beside), _near(scene))
     else:
         preset = camera if isinstance(camera, Camera) else PRESET_CAMERAS[camera](scene)
         result = _pinhole(aim_camera(preset, scene), scene, time)
@@ -183,34 +106,6 @@ def _view_of(scene: Scene, time: float, name: str) -> View:
         matrix[:, 3] -= matrix[:, :3] @ shift
         result = result._replace(matrix=matrix, eye=result.eye + shift)
     return result
-
-
-def _companion(camera: Camera, scene: Scene, reference: View) -> View:
-    """Return the view of a camera posed relative to a reference camera: X_this = R X_reference + T."""
-    rotation, translation = (np.array(pair_transform(camera)[key]) for key in ("rotation", "translation"))
-    world_to_reference = reference.axes * OPENCV_SIGNS
-    axes = rotation @ world_to_reference * OPENCV_SIGNS
-    eye = reference.eye - world_to_reference.T @ rotation.T @ translation
-    if camera.has_own_lens:
-        return _pinhole_at(camera, scene, Extrinsics(eye, axes, reference.distance))
-    # Keep the optics of the reference camera: move the world instead of the camera.
-    world_rotation, world_motion = reference.axes.T @ axes, np.eye(4)
-    world_motion[:3, :3], world_motion[:3, 3] = world_rotation, reference.eye - world_rotation @ eye
-    return reference._replace(matrix=reference.matrix @ world_motion, axes=axes, eye=eye)
-
-
-def pair_transform(camera: AnyCamera) -> dict[str, Any]:
-    """Return the transform from a camera's reference camera to the camera, in the convention of stereoCalibrate.
-
-    "beside": name of the reference camera; "rotation", 3 x 3, and "translation" [m] with X_this = R X_reference + T, in
-    OpenCV's axes. Empty without a reference camera.
-    """
-    if not isinstance(camera, Camera) or camera.beside is None:
-        return {}
-    rotation, translation = np.eye(3), [-(camera.baseline or 0.0), 0.0, 0.0]
-    if camera.rotation is not None and camera.translation is not None:
-        rotation, translation = _nearest_rotation(np.array(camera.rotation)), list(camera.translation)
-    return {"beside": camera.beside, "rotation": rotation.tolist(), "translation": translation}
 
 
 def is_moving(scene: Scene, name: str = "") -> bool:
@@ -314,12 +209,12 @@ def _extrinsics_problems(camera: Camera, scene: Scene) -> Iterator[Problem]:
         when = f" at {time:g} s" if camera.moves else ""
         if camera.eye is not None:
             eye, target, up = (
-                list(_interpolate_keyframes(value, time)) for value in (camera.eye, camera.target, camera.up)
+                list(interpolate_keyframes(value, time)) for value in (camera.eye, camera.target, camera.up)
             )
-            toward = _normalised(np.subtract(eye, target))
+            toward = normalised(np.subtract(eye, target))
             if math.dist(eye, target) < MIN_MAGNITUDE:
                 yield Problem(key, f"{eye} is also the target{when}; move one of them")
-            if not np.linalg.norm(np.cross(toward, _normalised(np.array(up)))) > 1e-9:
+            if not np.linalg.norm(np.cross(toward, normalised(np.array(up)))) > 1e-9:
                 yield Problem(("up",), f"{up} is zero or along the line of sight{when}; take a direction across it")
         # The matrix must be finite in f32, also multiplied by the samples per pixel.
         if np.abs(_pinhole(camera, scene, time).matrix).max() > float(np.finfo(np.float32).max) / MAX_SUPERSAMPLE:
@@ -435,28 +330,13 @@ def _top(scene: Scene) -> View:
 def _pinhole(camera: Camera, scene: Scene, time: float) -> View:
     placement = extrinsics(camera, time)
     # The distance is that at the start, so the light of a moving camera keeps its intensity.
-    return _pinhole_at(camera, scene, placement._replace(distance=extrinsics(camera, 0.0).distance))
+    placement = placement._replace(distance=extrinsics(camera, 0.0).distance)
+    return pinhole_view(camera, scene.render.size, placement, _near(scene))
 
 
-def _pinhole_at(camera: Camera, scene: Scene, placement: Extrinsics) -> View:
-    """Return the view of a pinhole camera, with these extrinsics in place of its own."""
-    (width_px, height_px), (eye, axes, distance) = scene.render.size, placement
-    right, up, toward = axes
-    depth = -toward
-    if (intrinsics := camera.intrinsics) is not None:
-        # The centre of the first pixel is (0, 0) in OpenCV, and (0.5, 0.5) in this package.
-        focal_x, focal_y = camera.focal_lengths
-        x, y = intrinsics.cx + 0.5, intrinsics.cy + 0.5
-    else:
-        focal_x = focal_y = height_px / 2 / np.tan(np.radians(camera.fov) / 2)
-        x, y = width_px / 2, height_px / 2
-    rows = [focal_x * right + x * depth, -focal_y * up + y * depth, depth, depth]
-    matrix = np.array([[*row, -row @ eye] for row in rows])
-    near, size = 1e-6 * rest_of(scene.sheet).diagonal, np.array([width_px, height_px], float)
-    scale, centre = np.array([focal_x, focal_y]), np.array([x, y])
-    lens = Lens(camera.distortion.model, camera.distortion.coefficients) if camera.distortion else None
-    lens = None if lens == IDENTITY_LENS else lens
-    return View(matrix, near, axes, eye, scale, centre, size, distance, pinhole=True, lens=lens)
+def _near(scene: Scene) -> float:
+    """Return the distance of the near plane [m]."""
+    return 1e-6 * rest_of(scene.sheet).diagonal
 
 
 def _fit(scene: Scene) -> Camera:
@@ -510,75 +390,5 @@ def _oblique(scene: Scene) -> Camera:
 PRESET_CAMERAS = {"oblique": _oblique, "fit": _fit}
 
 
-class Extrinsics(NamedTuple):
-    """Position and orientation of a camera at a time."""
-
-    eye: Array  # position [m], shape (3,)
-    axes: Array  # unit vectors right, up and toward the camera, as rows, shape (3, 3)
-    distance: float  # from the eye to the target; for a pose, to the centre of the sheet at rest [m]
-
-
-def extrinsics(camera: Camera, time: float) -> Extrinsics:
-    """Return the extrinsics of a camera without a reference camera, at a time [s]."""
-    if camera.pose is not None:
-        rotation = _nearest_rotation(np.array(camera.pose.rotation))
-        eye = -rotation.T @ np.array(camera.pose.translation)
-        return Extrinsics(eye, rotation * OPENCV_SIGNS, float(np.linalg.norm(eye)))
-    if camera.poses is not None:
-        assert not isinstance(camera.poses, str)
-        eye, rotation = _interpolate_poses(camera.poses, time)
-        return Extrinsics(eye, rotation.T * OPENCV_SIGNS, float(np.linalg.norm(eye)))
-    assert camera.eye is not None
-    eye, target, up = (_interpolate_keyframes(value, time) for value in (camera.eye, camera.target, camera.up))
-    return Extrinsics(np.array(eye), _look_at_axes(eye, target, up), math.dist(eye, target))
-
-
-def _look_at_axes(eye: Sequence[float], target: Sequence[float], up: Sequence[float]) -> Array:
-    """Return the axes of a camera, as in `Extrinsics`; `up`, of any length, is vertical in the picture."""
-    toward = _normalised(np.subtract(eye, target))
-    right = _normalised(np.cross(_rescaled(np.array(up)), toward))
-    return np.stack([right, np.cross(toward, right), toward])
-
-
-def _normalised(vector: Array) -> Array:
-    """Return the unit vector; a zero vector is unchanged."""
-    smaller = _rescaled(vector)
-    return smaller / (float(np.linalg.norm(smaller)) or 1.0)
-
-
-def _rescaled(vector: Array) -> Array:
-    """Scale a vector by a power of 2, which is exact, so that its squares neither overflow nor underflow."""
-    return np.ldexp(vector, -math.frexp(float(np.abs(vector).max()))[1])
-
-
-def _nearest_rotation(matrix: Array) -> Array:
-    """Return the nearest orthonormal matrix."""
-    left, _, right = np.linalg.svd(matrix)
-    return np.asarray(left @ right)
-
-
-def _interpolate_keyframes(value: Sequence[float] | Sequence[Sequence[float]], time: float) -> Sequence[float]:
-    """Return a constant vector as it is; interpolate keyframes (time [s], x, y, z) linearly, constant beyond them."""
-    keys = np.array(value)
-    if keys.ndim == 1:
-        return value  # type: ignore[return-value]
-    return [float(np.interp(time, keys[:, 0], keys[:, n])) for n in (1, 2, 3)]
-
-
-def _interpolate_poses(poses: Sequence[Sequence[float]], time: float) -> tuple[Array, Array]:
-    """Return the eye, interpolated linearly, and the rotation from the camera to the world, by slerp."""
-    from scipy.spatial.transform import Rotation, Slerp
-
-    times = [row[0] for row in poses]
-    n = min(max(bisect_right(times, time), 1), max(1, len(poses) - 1))
-    rows = np.array(poses[n - 1 : n + 1])
-    if len(rows) == 1:
-        return rows[0, 1:4], Rotation.from_quat(rows[0, 4:]).as_matrix()
-    clamped_time = min(max(time, rows[0, 0]), rows[1, 0])
-    fraction = (clamped_time - rows[0, 0]) / (rows[1, 0] - rows[0, 0])
-    rotation = Slerp(rows[:, 0], Rotation.from_quat(rows[:, 4:]))(clamped_time).as_matrix()
-    return rows[0, 1:4] * (1 - fraction) + rows[1, 1:4] * fraction, rotation
-
-
 # Axes of the presets oblique and fit: over the lower edge of the sheet, and 50 degrees above it.
-OBLIQUE_AXES = _look_at_axes((0.0, -0.64, 0.77), (0, 0, 0), (0, 1, 0))
+OBLIQUE_AXES = look_at_axes((0.0, -0.64, 0.77), (0, 0, 0), (0, 1, 0))

@@ -7,11 +7,12 @@ from collections.abc import Iterator
 import numpy as np
 from numpy.typing import NDArray
 
+from taichi_msm.cameras.view import View, pair_transform
 from taichi_msm.lenses import MODELS
 from taichi_msm.model.rest import rest_of
 from taichi_msm.model.tool_force import control_points
 from taichi_msm.render import texture
-from taichi_msm.render.camera import View, is_moving, pair_transform, view_at
+from taichi_msm.render.camera import is_moving, view_at
 from taichi_msm.scene.camera import Camera, Distortion
 from taichi_msm.scene.render import Light
 from taichi_msm.scene.scene import Scene

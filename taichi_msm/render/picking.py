@@ -6,9 +6,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from taichi_msm.arithmetic import Array
+from taichi_msm.cameras.view import View
 from taichi_msm.model.crossings import cells_on_line
 from taichi_msm.model.rest import rest_of
-from taichi_msm.render.camera import View
 from taichi_msm.scene.sheet import Sheet
 
 # Number of cells that are processed at a time, to bound the memory.

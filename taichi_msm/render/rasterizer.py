@@ -14,9 +14,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from taichi_msm.cameras.view import View
 from taichi_msm.model.surface import Solid
 from taichi_msm.render import uniforms as uni
-from taichi_msm.render.camera import View, view_at
+from taichi_msm.render.camera import view_at
 from taichi_msm.render.config import DrawingConfig
 from taichi_msm.render.cpu import Bands
 from taichi_msm.render.gpu import Threads

@@ -9,8 +9,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from taichi_msm.cameras.view import View
 from taichi_msm.errors import ArgumentError, as_array, did_you_mean, is_real_array
-from taichi_msm.render.camera import Shot, View, is_moving, view, view_at
+from taichi_msm.render.camera import Shot, is_moving, view, view_at
 from taichi_msm.render.labels import LABELS, Flow, FrameOutputs, Labels, Sight, Stereo, requested_labels, track_grid
 from taichi_msm.render.texture import load_texture
 from taichi_msm.scene.camera import Camera

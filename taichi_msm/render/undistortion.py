@@ -11,8 +11,9 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from taichi_msm.render.camera import View, border_points
-from taichi_msm.render.lens import Lens
+from taichi_msm.cameras.lens import Lens
+from taichi_msm.cameras.view import View
+from taichi_msm.render.camera import border_points
 
 Pair = tuple[float, float]
 

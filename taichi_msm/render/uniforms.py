@@ -13,9 +13,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from taichi_msm.arithmetic import Array
+from taichi_msm.cameras.view import View
 from taichi_msm.model.rest import rest_of
 from taichi_msm.model.surface import Solid
-from taichi_msm.render.camera import View
 from taichi_msm.render.undistortion import visible_region
 from taichi_msm.scene.scene import Scene
 from taichi_msm.shapes import SHAPES

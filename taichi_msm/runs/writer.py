@@ -17,12 +17,13 @@ from PIL import Image
 from typing_extensions import NotRequired
 
 from taichi_msm.accuracy.surface import SurfaceRecord
+from taichi_msm.cameras.view import pair_transform
 from taichi_msm.errors import writing
 from taichi_msm.model.plan import Plan
 from taichi_msm.model.rest import CurvedRest, rest_of
 from taichi_msm.model.surface import surface_positions
 from taichi_msm.model.tool_force import ProbeRecord
-from taichi_msm.render.camera import calibration, is_moving, pair_transform, pose, view_at
+from taichi_msm.render.camera import calibration, is_moving, pose, view_at
 from taichi_msm.render.labels import FrameOutputs, track_grid
 from taichi_msm.runs.arrays import ChunkedArray, write_arrays, write_flo
 from taichi_msm.runs.checkpoint import CHECKPOINT_FOLDER, CHECKPOINT_PATTERNS, Checkpoint

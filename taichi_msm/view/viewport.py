@@ -9,8 +9,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from taichi_msm.cameras.view import View
 from taichi_msm.model.surface import Solid
-from taichi_msm.render.camera import Shot, View, frozen_camera, orbit_camera, pinhole, view
+from taichi_msm.render.camera import Shot, frozen_camera, orbit_camera, pinhole, view
 from taichi_msm.render.renderer import Renderer
 from taichi_msm.runs.media import Picture
 from taichi_msm.scene.camera import Camera

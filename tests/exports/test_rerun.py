@@ -14,9 +14,9 @@ import pytest
 from PIL import Image
 
 from taichi_msm import NotInstalledError, export
+from taichi_msm.cameras.lens import IDENTITY_LENS
 from taichi_msm.model.surface import place_instruments
 from taichi_msm.render.camera import view_at
-from taichi_msm.render.lens import IDENTITY_LENS
 from taichi_msm.runs.arrays import read_flo
 from taichi_msm.runs.finished import read_run
 from tests.golden import Messages

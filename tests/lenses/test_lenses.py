@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from taichi_msm.cameras.lens import Lens
 from taichi_msm.errors import SceneError
 from taichi_msm.lenses import MODELS
 from taichi_msm.lenses.model import MAX_RADIUS
@@ -16,7 +17,6 @@ from taichi_msm.model.sheet import rest_positions
 from taichi_msm.model.surface import place_instruments
 from taichi_msm.render import tracking, uniforms
 from taichi_msm.render.camera import calibration, view
-from taichi_msm.render.lens import Lens
 from taichi_msm.render.picking import pick
 from taichi_msm.scene.scene import Scene
 from taichi_msm.system.runtime import Device

@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 
 from taichi_msm.arithmetic import Operations
+from taichi_msm.cameras.lens import Lens
 from taichi_msm.lenses import MODELS
 from taichi_msm.lenses.model import Coefficient, LensModel
-from taichi_msm.render.lens import Lens
 from taichi_msm.render.lens_kernels import compile_lens
 from taichi_msm.system.runtime import Device, ti
 

@@ -9,9 +9,10 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from taichi_msm.cameras.view import View
 from taichi_msm.model.surface import Solid
 from taichi_msm.render import uniforms
-from taichi_msm.render.camera import View, view
+from taichi_msm.render.camera import view
 from taichi_msm.scene.scene import Scene
 from tests.reference.lens import undistorted
 from tests.reference.shading import headlight, intersect, metal, normals, normals_at, sample, tissue

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from taichi_msm.render.camera import View
+from taichi_msm.cameras.view import View
 
 Array = NDArray[np.float64]
 

@@ -7,9 +7,9 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
+from taichi_msm.cameras.view import View
 from taichi_msm.model.surface import Solid
 from taichi_msm.render import uniforms
-from taichi_msm.render.camera import View
 from taichi_msm.scene.scene import Scene
 from tests.reference.lens import undistorted
 

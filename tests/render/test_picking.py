@@ -7,8 +7,9 @@ from typing import Any
 import numpy as np
 import pytest
 
+from taichi_msm.cameras.extrinsics import extrinsics
 from taichi_msm.model.sheet import rest_positions
-from taichi_msm.render.camera import extrinsics, orbit_camera, pinhole, view
+from taichi_msm.render.camera import orbit_camera, pinhole, view
 from taichi_msm.render.picking import intersect_rest_plane, pick
 from taichi_msm.render.rasterizer import Rasterizer
 from taichi_msm.scene.scene import Scene

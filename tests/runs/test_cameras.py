@@ -13,11 +13,12 @@ import pytest
 from PIL import Image
 
 from taichi_msm import ArgumentError, Playback, Simulation, resume, run
+from taichi_msm.cameras.view import pair_transform
 from taichi_msm.errors import ForeignError, SceneError
 from taichi_msm.load.scene_file import load_scene
 from taichi_msm.model.surface import place_instruments
 from taichi_msm.render import rasterizer
-from taichi_msm.render.camera import calibration, is_moving, pair_transform, view, view_at
+from taichi_msm.render.camera import calibration, is_moving, view, view_at
 from taichi_msm.render.rasterizer import Rasterizer
 from taichi_msm.runs.finished import read_run
 from taichi_msm.scene.scene import Scene

@@ -1,0 +1,1 @@
+"""Cameras below the scene: lens, extrinsics, and the view from a point in the world to pixels."""
