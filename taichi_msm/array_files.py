@@ -47,6 +47,20 @@ def read_array_file(
     """
     import numpy as np
 
+    array, sha256 = read_raw_array(path, names, is_shape, shapes)
+    values = array.astype(np.float64) * unit
+    # NaN also fails this comparison.
+    is_small = np.abs(values) <= MAX_M
+    if not is_small.all():
+        at = ", ".join(map(str, np.unravel_index(int((~is_small).argmax()), array.shape)))
+        raise PictureError(f"{path}: [{at}] is {array[~is_small][0]}", f"give finite numbers, of up to {MAX_M:g} m")
+    return ArrayFile(values, sha256, unit * quantum(array))
+
+
+def read_raw_array(
+    path: str, names: Sequence[str], is_shape: Callable[[tuple[int, ...]], bool], shapes: str
+) -> tuple[NDArray[Any], str]:
+    """Return the array of `read_array_file` as it is in the file, and the SHA-256 of the file."""
     try:
         data = read_regular(actual_path(path), MAX_BYTES)
     except (OSError, ValueError) as error:
@@ -63,13 +77,7 @@ def read_array_file(
         raise PictureError(f"{path} has an array of {array.dtype}", remedy)
     if not is_shape(array.shape) or 0 in array.shape:
         raise PictureError(f"{path} has an array of shape {array.shape}", remedy)
-    values = array.astype(np.float64) * unit
-    # NaN also fails this comparison.
-    is_small = np.abs(values) <= MAX_M
-    if not is_small.all():
-        at = ", ".join(map(str, np.unravel_index(int((~is_small).argmax()), array.shape)))
-        raise PictureError(f"{path}: [{at}] is {array[~is_small][0]}", f"give finite numbers, of up to {MAX_M:g} m")
-    return ArrayFile(values, hashlib.sha256(data).hexdigest(), unit * quantum(array))
+    return array, hashlib.sha256(data).hexdigest()
 
 
 def quantum(values: NDArray[Any]) -> float:

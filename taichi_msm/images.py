@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 import stat
 import warnings
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
 from mmap import ACCESS_READ, mmap
 from pathlib import Path
@@ -84,6 +84,16 @@ def read_grey(path: str, sha256: str | None = None) -> NDArray[Any]:
         return np.asarray(_to_rgb(image, (0, 0, 0)).convert("L"))
 
 
+def read_depth(path: str, sha256: str | None = None) -> NDArray[Any]:
+    """Read the numbers of an upright picture with one channel, of 8 or 16 bits or floating-point, shape (h, w)."""
+    import numpy as np
+    from PIL import ImageOps
+
+    with _open(path, sha256, (*_MODES_16_BIT, "L", "F")) as opened:
+        image = ImageOps.exif_transpose(opened)
+        return np.asarray(image).astype(np.uint16) if image.mode in _MODES_16_BIT else np.asarray(image)
+
+
 def picture_size(path: str) -> tuple[int, int]:
     """Return the width and height of the upright picture [px], from the file's header."""
     from PIL import Image
@@ -113,7 +123,7 @@ def file_sha256(path: str) -> str:
 
 
 @contextmanager
-def _open(path: str, sha256: str | None = None) -> Iterator[Image.Image]:
+def _open(path: str, sha256: str | None = None, modes: Sequence[str] = _MODES) -> Iterator[Image.Image]:
     """Open and check a picture; convert all errors, also of the block, to a PictureError."""
     from PIL import Image, UnidentifiedImageError
 
@@ -140,8 +150,9 @@ def _open(path: str, sha256: str | None = None) -> Iterator[Image.Image]:
                     limit = max(16, 200_000_000 // (image.width * image.height))
                     if scans > limit:
                         raise PictureError(f"{path} has {scans} scans, more than {limit}", "save it again")
-                if image.mode not in _MODES:
-                    raise PictureError(f"{path} has pixels of kind {image.mode}", "save it as 8-bit RGB")
+                if image.mode not in modes:
+                    remedy = "save it as 8-bit RGB" if modes == _MODES else "save one number a pixel, or an .npy array"
+                    raise PictureError(f"{path} has pixels of kind {image.mode}", remedy)
                 yield image
         except PictureError:
             raise

@@ -9,8 +9,9 @@ import numpy as np
 from typing_extensions import TypedDict
 
 from taichi_msm.model.cells import cell_stiffness
+from taichi_msm.model.geometry import CurvedRest
 from taichi_msm.model.plan import Plan
-from taichi_msm.model.rest import CurvedRest, rest_of
+from taichi_msm.model.rest import rest_of
 from taichi_msm.model.surface_checks import (
     FOLD_REMEDY,
     describe_fold,

@@ -217,7 +217,7 @@ def _initial_factors(plan: Plan, resolution: int) -> Array:
     tissue, image = plan.scene.tissue, plan.maps.get("map")
     if tissue is None or tissue.map is None or image is None:
         return np.ones((resolution, resolution))
-    return map_factors(tissue.map, image, centres(resolution), centres(resolution))
+    return map_factors(tissue.map, image, centres(resolution), centres(resolution)[:, None])
 
 
 def _cells(plan: Plan) -> tuple[int, int]:

@@ -158,23 +158,22 @@ def read_map(stiffness_map: StiffnessMap) -> MapImage:
 
 def cell_factors(stiffness_map: StiffnessMap, image: MapImage, sheet: Sheet) -> Array:
     """Return the factors of a stiffness map at the centres of the cells, shape (rows - 1, cols - 1)."""
-    rows, cols = (count - 1 for count in sheet.points)
-    return map_factors(stiffness_map, image, (np.arange(rows) + 0.5) / rows, (np.arange(cols) + 0.5) / cols)
+    return map_factors(stiffness_map, image, *rest_of(sheet).cell_places)
 
 
 def point_factors(stiffness_map: StiffnessMap, image: MapImage, sheet: Sheet) -> Array:
     """Return the factors of a stiffness map at the mass points, shape (rows, cols)."""
-    rows, cols = (np.arange(count) / (count - 1) for count in sheet.points)
-    return map_factors(stiffness_map, image, rows, cols)
+    return map_factors(stiffness_map, image, *rest_of(sheet).point_places)
 
 
-def map_factors(stiffness_map: StiffnessMap, image: MapImage, rows: Array, cols: Array) -> Array:
+def map_factors(stiffness_map: StiffnessMap, image: MapImage, across: Array, down: Array) -> Array:
     """Return the factors of a stiffness map, bilinear between pixel centres, constant beyond them, shape (m, n).
 
-    `rows`, shape (m,), and `cols`, shape (n,), are fractions of the height from the top and of the width from the left.
+    `across` and `down` are fractions of the width from the left and of the height from the top, which broadcast to (m,
+    n).
     """
     black, white = stiffness_map.range
-    grey = sample_bilinearly(image.grey.astype(float), rows, cols)
+    grey = sample_bilinearly(image.grey.astype(float), down, across)
     return black + (white - black) / np.iinfo(image.grey.dtype).max * grey
 
 

@@ -36,7 +36,8 @@ def surface_point(position: NDArray[np.floating], refine: int, sheet: Sheet, at:
     """
     rest = rest_of(sheet)
     inside = np.clip(rest.fractions(at), 0.0, 1.0)
-    point, normal = (values[0] for values in _interpolate(position, refine, inside[None]))
+    place = np.clip(rest.mesh_places(inside[None]), 0.0, 1.0)
+    point, normal = (values[0] for values in _interpolate(position, refine, place))
     outside = rest.place(np.asarray(at)[None])[0] - rest.place(rest.coordinates(inside)[None])[0]
     return point + outside, normal / max(float(np.linalg.norm(normal)), 1e-300)
 

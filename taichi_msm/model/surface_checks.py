@@ -11,7 +11,8 @@ from numpy.typing import NDArray
 from taichi_msm.arithmetic import Array
 from taichi_msm.errors import Problem
 from taichi_msm.images import PictureError
-from taichi_msm.model.rest import CurvedRest, rest_of
+from taichi_msm.model.geometry import CurvedRest
+from taichi_msm.model.rest import rest_of
 from taichi_msm.scene.scene import Scene
 from taichi_msm.scene.section import MAX_POINTS
 

@@ -22,7 +22,8 @@ import numpy as np
 from typing_extensions import TypedDict
 
 from taichi_msm.arithmetic import Array
-from taichi_msm.model.rest import CurvedRest, rest_of
+from taichi_msm.model.geometry import CurvedRest
+from taichi_msm.model.rest import rest_of
 from taichi_msm.scene.scene import Scene
 from taichi_msm.scene.sheet import Sheet
 from taichi_msm.scene.tools import Probe

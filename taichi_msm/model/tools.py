@@ -22,7 +22,8 @@ from numpy.typing import NDArray
 
 from taichi_msm.arithmetic import NUMPY, Array
 from taichi_msm.errors import Problem
-from taichi_msm.model.rest import Rest, rest_of
+from taichi_msm.model.geometry import Rest
+from taichi_msm.model.rest import rest_of
 from taichi_msm.model.sheet import SIDES, fixed_points, fixed_sides, rest_positions
 from taichi_msm.model.time_grid import TimeGrid
 from taichi_msm.scene.scene import Scene

@@ -19,8 +19,9 @@ from typing_extensions import NotRequired
 from taichi_msm.accuracy.surface import SurfaceRecord
 from taichi_msm.cameras.view import pair_transform
 from taichi_msm.errors import writing
+from taichi_msm.model.geometry import CurvedRest
 from taichi_msm.model.plan import Plan
-from taichi_msm.model.rest import CurvedRest, rest_of
+from taichi_msm.model.rest import rest_of
 from taichi_msm.model.surface import surface_positions
 from taichi_msm.model.tool_force import ProbeRecord
 from taichi_msm.render.camera import calibration, is_moving, pose, view_at

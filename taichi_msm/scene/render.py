@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Collection, Mapping
+from collections.abc import Collection, Iterator, Mapping
+from contextlib import contextmanager
+from contextvars import ContextVar
 from typing import Annotated, Any, Literal
 
 from pydantic import Field, StrictBool, ValidationInfo, field_validator, model_validator
@@ -29,6 +31,20 @@ from taichi_msm.scene.section import (
 # A preset, by its name, or a pinhole camera.
 AnyCamera = Literal["top", "oblique", "fit"] | Camera
 PRESETS = ("top", "oblique", "fit")
+
+
+# Width and height of the picture to which calibrations refer [px], where it is not `size`.
+_calibrated_size: ContextVar[tuple[int, int] | None] = ContextVar("calibrated_size", default=None)
+
+
+@contextmanager
+def calibrated_size(size: tuple[int, int] | None) -> Iterator[None]:
+    """Let calibrations refer to pictures of a width and height within the block [px]; None: to `size`."""
+    token = _calibrated_size.set(size)
+    try:
+        yield
+    finally:
+        _calibrated_size.reset(token)
 
 
 class Light(Section):
@@ -180,7 +196,8 @@ def _read_files(camera: AnyCamera, info: ValidationInfo) -> AnyCamera:
         return camera
     camera = camera.with_poses()
     # An invalid size is reported separately.
-    return camera.calibrated(info.data["size"]) if "size" in info.data else camera
+    size = _calibrated_size.get() or info.data.get("size")
+    return camera.calibrated(size) if size else camera
 
 
 def _check_reference_camera(name: str, cameras: Mapping[str, AnyCamera]) -> None:

@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from typing import Annotated, Literal
+from collections.abc import Callable, Mapping
+from typing import Annotated, Any, Literal
 
-from pydantic import ConfigDict, Field, model_validator
+from pydantic import ConfigDict, Field, ModelWrapValidatorHandler, model_validator
 
 from taichi_msm.integrators import INTEGRATORS, Integrator
+from taichi_msm.scene.framing import complete_framed, frame_sheet, framed_image_size
 from taichi_msm.scene.outputs import ENTRIES, OUTPUTS
-from taichi_msm.scene.render import Render
+from taichi_msm.scene.render import Render, calibrated_size
 from taichi_msm.scene.section import (
     FRAME_TOLERANCE,
     MAX_PROBES,
@@ -208,6 +209,17 @@ class Scene(Section):
         material = self.tissue or self.springs
         changed = None if material is None else material.model_copy(update=maps)
         return self.model_copy(update={"image": image, self.kind: changed, "sheet": self.sheet.with_files(path)})
+
+    @model_validator(mode="wrap")
+    @classmethod
+    def _frame(cls, data: Any, handler: ModelWrapValidatorHandler[Scene]) -> Scene:
+        """Let cameras refer to the size of an image that one of them took, and give the surface its `Frame`."""
+        size = framed_image_size(data) if isinstance(data, Mapping) else None
+        with calibrated_size(size):
+            scene = handler(data if size is None else complete_framed(data, size))
+        # The scene is frozen.
+        scene.__dict__["sheet"] = frame_sheet(scene.sheet, scene.render, size, scene.region)
+        return scene
 
     @model_validator(mode="after")
     def _check_image_given(self) -> Scene:

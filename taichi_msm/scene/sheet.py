@@ -79,7 +79,7 @@ class SheetMask(Section):
 def _complete_schema(schema: dict[str, Any]) -> None:
     """Add to the schema of a sheet what its validators allow.
 
-    With surface.points, the size is not allowed, and the number of points is that of the file by default.
+    With surface.points and depth, the size is not allowed, and the number of points is that of the file by default.
     """
     schema |= {"required": [], "anyOf": [{"required": ["points", "size"]}, {"required": ["surface"]}]}
     schema["properties"]["mask"]["anyOf"].insert(0, {"type": "string", "minLength": 1, "maxLength": MAX_PATH})
@@ -98,11 +98,11 @@ class Sheet(Section):
     size: tuple[Positive, Positive] = key(
         ...,
         "height, width of the sheet at rest, with a surface of the flat sheet that is bent [m]; not with "
-        "surface.points, which has its own",
+        "surface.depth and points, which have their own",
         "two numbers above 0: [height, width] in metres",
     )
     surface: RestSurface | None = key(
-        None, "the sheet at rest, where it is not flat", "a mapping with one of height, tube, dome, points"
+        None, "the sheet at rest, where it is not flat", "a mapping with one of height, tube, dome, depth, points"
     )
     mass: Positive | None = key(
         None,
@@ -133,16 +133,20 @@ class Sheet(Section):
 
     @model_validator(mode="before")
     @classmethod
-    def _complete_point_grid(cls, data: Any) -> Any:
+    def _complete_sizes(cls, data: Any) -> Any:
         """Add to `surface.points` the number of points of its file, unless it is given, and an unused size."""
         surface = data.get("surface") if isinstance(data, Mapping) else None
-        grid = surface.get("points") if isinstance(surface, Mapping) else getattr(surface, "points", None)
-        if grid is None:
+        grid, depth = (
+            surface.get(name) if isinstance(surface, Mapping) else getattr(surface, name, None)
+            for name in ("points", "depth")
+        )
+        if grid is None and depth is None:
             return data
         if "size" in data:
-            raise scene_fault("conflicts with surface.points, whose size is that of its points; remove size", "size")
+            kind, owner = ("depth", "the surface") if grid is None else ("points", "its points")
+            raise scene_fault(f"conflicts with surface.{kind}, whose size is that of {owner}; remove size", "size")
         points = data.get("points")
-        if points is None:
+        if points is None and grid is not None:
             try:
                 grid = grid if isinstance(grid, PointGrid) else PointGrid.model_validate(grid)
                 points = grid.points.values.shape[:2]
@@ -155,14 +159,14 @@ class Sheet(Section):
                     f"{grid.file} has {points[0]} x {points[1]} points; set sheet.points, at most {MAX_POINTS} a side"
                 )
                 raise scene_fault(text, "surface", "points", "file")
-        return {**data, "points": points, "size": (1.0, 1.0)}
+        return {**data, **({} if points is None else {"points": points}), "size": (1.0, 1.0)}
 
     @model_validator(mode="after")
     def _check_surface(self) -> Self:
         surface, (height, width) = self.surface, self.size
         if surface is None:
             return self
-        if surface.points:
+        if surface.has_own_size:
             # It is not given.
             self.__pydantic_fields_set__.discard("size")
         if surface.tube and width > 2 * math.pi * abs(surface.tube.radius) * (1 + 1e-9):
@@ -176,7 +180,7 @@ class Sheet(Section):
         return self
 
     def _unused_keys(self) -> Collection[str]:
-        unused = ("size",) if self.surface and self.surface.points else () if self.surface else ("surface",)
+        unused = ("size",) if self.surface and self.surface.has_own_size else () if self.surface else ("surface",)
         return unused if self.mask else (*unused, "mask")
 
     @property

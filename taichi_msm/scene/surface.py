@@ -1,17 +1,22 @@
-"""Section `sheet.surface`: the sheet at rest, where it is not flat, and the files of its heights and points."""
+"""Section `sheet.surface`: the sheet at rest, where it is not flat, and the files of heights, points and depths."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Collection
+from dataclasses import dataclass
 from functools import cached_property
-from typing import Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal, NamedTuple
 
-from pydantic import AfterValidator, ConfigDict, model_validator
+from pydantic import AfterValidator, ConfigDict, Field, PrivateAttr, model_validator
 from typing_extensions import Self
 
-from taichi_msm.array_files import ArrayFile, quantum, read_array_file
-from taichi_msm.images import PICTURE_SUFFIXES, file_sha256, read_grey
+from taichi_msm.array_files import ArrayFile, quantum, read_array_file, read_raw_array
+from taichi_msm.images import PICTURE_SUFFIXES, file_sha256, read_depth, read_grey
+from taichi_msm.scene.camera import Camera
 from taichi_msm.scene.section import FilePath, NotNegative, Number, Positive, Section, key, scene_fault
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
 
 METRES = {"m": 1.0, "mm": 1e-3, "um": 1e-6}
 
@@ -103,6 +108,60 @@ class Dome(Section):
     radius: Radius = key(..., "radius [m]; below 0 for a bowl", "a number other than 0, in metres")
 
 
+@dataclass(frozen=True, eq=False)
+class DepthFile:
+    """A depth map, compared by identity."""
+
+    depth: NDArray[Any]  # [m], NaN where there is none, shape (h, w)
+    sha256: str  # of the file
+    step: float  # the depths are multiples of it, but for an offset [m]; 0 for floating-point numbers
+
+
+class DepthMap(Section):
+    """Depth of every pixel of the image, seen by a camera."""
+
+    file: FilePath = key(
+        ...,
+        "path of a picture of one channel, or of an .npy or .npz array (h, w), or (h, w, 3) of points, of the depth of "
+        "every pixel of `image`; 0, the largest integer, NaN and infinity are no depth; relative to the scene file, in "
+        "its folder or below",
+        "the path of a picture or of an array",
+    )
+    unit: Unit = key(..., "unit of the file", _UNIT_EXPECTS)
+    camera: Annotated[str, Field(strict=True, min_length=1)] | None = key(
+        None, "name of the camera, one of render.cameras; default: the main camera", "the name of a camera"
+    )
+    along: Literal["axis", "ray"] = key(
+        "axis", "axis: along the viewing direction; ray: distance from the eye", "axis or ray"
+    )
+    smooth: Literal["auto"] | NotNegative = key(
+        "auto",
+        "standard deviation of the smoothing [px]; auto: half the mean side of a cell; 0: none",
+        "auto, or a number, 0 or more, in pixels",
+    )
+
+    @cached_property
+    def depths(self) -> DepthFile:
+        """Depths, read once; a PictureError if the file cannot be used."""
+        import numpy as np
+
+        if self.file.lower().endswith(PICTURE_SUFFIXES):
+            sha256 = file_sha256(self.file)
+            values = read_depth(self.file, sha256)
+        else:
+            values, sha256 = read_raw_array(
+                self.file,
+                ("depth", "z"),
+                lambda shape: len(shape) == 2 or (len(shape) == 3 and shape[2] == 3),
+                "(h, w) or (h, w, 3)",
+            )
+            values = values[..., 2] if values.ndim == 3 else values
+        largest = np.iinfo(values.dtype).max if values.dtype.kind in "iu" else np.inf
+        is_depth = (values > 0) & (values < largest)
+        depth = np.where(is_depth, values, np.nan).astype(np.float64) * metres(self.unit)
+        return DepthFile(depth, sha256, metres(self.unit) * (quantum(values[is_depth]) if is_depth.any() else 0.0))
+
+
 class PointGrid(Section):
     """Positions of a grid of points from a file."""
 
@@ -126,53 +185,112 @@ class PointGrid(Section):
         )
 
 
+class Frame(NamedTuple):
+    """The picture on a surface that a camera sees at the start, and that camera."""
+
+    cameras: tuple[Camera, ...]  # the camera, then the one that it is `beside`, and so on
+    image_size: tuple[int, int]  # width and height of `image`, to which calibrations refer [px]
+    region: tuple[int, int, int, int]  # x, y, width and height of the part on the sheet [px]
+    points: tuple[int, int]  # rows and columns from which smoothing and grid follow
+    is_kept: bool = False  # whether other meshes keep these points
+
+
+KINDS = ("height", "tube", "dome", "depth", "points")
+
+
 class RestSurface(Section):
     """The sheet at rest, where it is not flat; exactly one of its kinds."""
 
-    model_config = ConfigDict(
-        json_schema_extra={"oneOf": [{"required": [name]} for name in ("height", "tube", "dome", "points")]}
-    )
+    model_config = ConfigDict(json_schema_extra={"oneOf": [{"required": [name]} for name in KINDS]})
 
     height: HeightField | None = key(
         None, "heights over the flat sheet", "a mapping with file, and range of a picture or unit of an array"
     )
     tube: Tube | None = key(None, "the sheet is rolled to a tube about an axis along y", "a mapping: {radius: [m]}")
     dome: Dome | None = key(None, "the sheet is a part of a sphere", "a mapping: {radius: [m]}")
+    depth: DepthMap | None = key(
+        None, "depth of `image`, seen by a camera of the scene", "a mapping with file and unit"
+    )
     points: PointGrid | None = key(None, "positions of a grid of points", "a mapping with file and unit")
+    grid: Literal["even", "given"] | None = key(
+        None,
+        "with depth or points. even: mass points are spread over the surface, in cells of one aspect (default of "
+        "depth); given: as in the file (default of points)",
+        "even or given",
+    )
+    picture: Annotated[str, Field(strict=True, min_length=1)] | None = key(
+        None,
+        "with points: name of the camera by whose picture, `image`, the surface is coloured; the main camera without "
+        "a name is main; default: the image is spread by rows and columns",
+        "the name of a camera",
+    )
+    # Of a surface with a picture by a camera, set by the scene.
+    _frame: Frame | None = PrivateAttr(None)
+
+    @property
+    def frame(self) -> Frame | None:
+        """The picture by a camera; None where the image is spread by rows and columns."""
+        return self._frame
+
+    def with_frame(self, frame: Frame | None) -> RestSurface:
+        """Return a copy with another frame."""
+        surface = self.model_copy()
+        surface.__pydantic_private__ = {"_frame": frame}
+        return surface
+
+    @property
+    def frame_key(self) -> tuple[str, ...] | None:
+        """Key of the name of the frame's camera below `surface`; None without a frame."""
+        return ("depth", "camera") if self.depth else ("picture",) if self.picture else None
+
+    @property
+    def is_even(self) -> bool:
+        """Whether the mass points are spread evenly over the surface of the file."""
+        return self.grid == "even" or (self.depth is not None and self.grid is None)
 
     @property
     def _given_kinds(self) -> list[str]:
         """Names of the given kinds."""
-        # Iteration over a model would include its cached properties.
-        return [name for name in type(self).model_fields if getattr(self, name) is not None]
+        return [name for name in KINDS if getattr(self, name) is not None]
 
     @property
     def kind(self) -> str:
         """Name of the kind."""
         return self._given_kinds[0]
 
+    @property
+    def has_own_size(self) -> bool:
+        """Whether the size of the sheet follows from the file."""
+        return self.depth is not None or self.points is not None
+
+    @property
+    def _file_section(self) -> HeightField | DepthMap | PointGrid | None:
+        return self.height or self.depth or self.points
+
     @cached_property
-    def file(self) -> ArrayFile | None:
+    def file(self) -> ArrayFile | DepthFile | None:
         """Content of the file, read once; None for a kind without one, and a PictureError if it cannot be used."""
-        return self.height.heights if self.height else self.points.points if self.points else None
+        if self.height:
+            return self.height.heights
+        return self.depth.depths if self.depth else self.points.points if self.points else None
 
     @property
     def file_key(self) -> tuple[str, ...]:
         """Key of the file below `surface`; () for a kind without one."""
-        return (self.kind, "file") if self.height or self.points else ()
+        return (self.kind, "file") if self._file_section else ()
 
     def _unused_keys(self) -> Collection[str]:
-        return type(self).model_fields.keys() - {self.kind}
+        used = {self.kind, *(name for name in ("grid", "picture") if getattr(self, name) is not None)}
+        return type(self).model_fields.keys() - used
 
     @property
     def path(self) -> str:
         """Path of the file; empty for a kind without one."""
-        section = self.height or self.points
-        return section.file if section else ""
+        return self._file_section.file if self._file_section else ""
 
     def with_path(self, path: Callable[[str], str]) -> RestSurface:
         """Return a copy with the path p of the file, if the kind has one, replaced by `path(p)`."""
-        section = self.height or self.points
+        section = self._file_section
         if section is None:
             return self
         return self.model_copy(update={self.kind: section.model_copy(update={"file": path(section.file)})})
@@ -180,9 +298,14 @@ class RestSurface(Section):
     @model_validator(mode="after")
     def _check_one_kind(self) -> Self:
         if not self._given_kinds:
-            raise scene_fault("is empty; expected one of height, tube, dome, points")
+            raise scene_fault(f"is empty; expected one of {', '.join(KINDS)}")
         if len(self._given_kinds) > 1:
             raise scene_fault(f"conflicts with {self.kind}; remove one of them", self._given_kinds[1])
+        if self.grid is not None and not (self.depth or self.points):
+            raise scene_fault(f"needs depth or points; remove it, as {self.kind} has an even grid", "grid")
+        if self.picture is not None and not self.points:
+            remedy = "set depth.camera" if self.depth else "remove it"
+            raise scene_fault(f"needs points; {remedy}", "picture")
         return self
 
 

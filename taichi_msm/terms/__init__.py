@@ -12,8 +12,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from taichi_msm.model.geometry import CurvedRest
 from taichi_msm.model.plan import Plan
-from taichi_msm.model.rest import CurvedRest, rest_of
+from taichi_msm.model.rest import rest_of
 from taichi_msm.model.sheet import Maps, Material, cell_factors, point_areas, point_factors
 from taichi_msm.scene.scene import Scene
 from taichi_msm.scene.sheet import Sheet

@@ -31,8 +31,9 @@ from typing_extensions import Self
 from taichi_msm.laws import law_of
 from taichi_msm.laws.law import Law
 from taichi_msm.model.cells import CellStiffness, cell_stiffness, sum_around_points
+from taichi_msm.model.geometry import CurvedRest
 from taichi_msm.model.plan import Plan
-from taichi_msm.model.rest import CurvedRest, rest_of
+from taichi_msm.model.rest import rest_of
 from taichi_msm.model.sheet import Material, Springs, largest_mean, spacing
 from taichi_msm.scene.scene import Scene
 from taichi_msm.scene.sheet import Sheet

@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from taichi_msm.model.rest import CurvedRest, rest_of
+from taichi_msm.model.geometry import CurvedRest
+from taichi_msm.model.rest import rest_of
 from taichi_msm.model.surface import place_instruments, surface_positions
 from taichi_msm.render.camera import Shot, view, view_at
 from taichi_msm.render.labels import LABELS, NO_FLOW

@@ -11,7 +11,8 @@ import pytest
 from numpy.typing import NDArray
 
 from taichi_msm.model.cells import Cells, isotropy_errors
-from taichi_msm.model.rest import CurvedRest, rest_of
+from taichi_msm.model.geometry import CurvedRest
+from taichi_msm.model.rest import rest_of
 from taichi_msm.model.tools import solid_tools
 from taichi_msm.scene.scene import Scene
 from taichi_msm.solver.arrays import SheetLayout

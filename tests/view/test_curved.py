@@ -13,7 +13,8 @@ import pytest
 from numpy.typing import NDArray
 
 from taichi_msm import load_scene, run
-from taichi_msm.model.rest import CurvedRest, rest_of
+from taichi_msm.model.geometry import CurvedRest
+from taichi_msm.model.rest import rest_of
 from taichi_msm.model.sheet import rest_positions
 from taichi_msm.model.surface import place_instruments
 from taichi_msm.system.runtime import Device

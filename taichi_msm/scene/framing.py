@@ -1,0 +1,104 @@
+"""The picture on a surface that a camera of the scene sees: its size, which cameras refer to, and its `Frame`."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+from taichi_msm.images import PictureError, picture_size
+from taichi_msm.scene.camera import Camera
+from taichi_msm.scene.render import Render
+from taichi_msm.scene.section import scene_fault
+from taichi_msm.scene.sheet import Sheet
+from taichi_msm.scene.surface import Frame
+
+# A camera at the origin that looks along -z, with x to the right and y up, in the convention of `Pose`.
+POSE_AT_ORIGIN = {"rotation": [[1, 0, 0], [0, -1, 0], [0, 0, -1]], "translation": [0, 0, 0]}
+
+# Name of the main camera in `picture` if it has none.
+MAIN = "main"
+
+
+def framed_image_size(data: Mapping[str, Any]) -> tuple[int, int] | None:
+    """Return the size of the image of a scene, maybe invalid, whose surface has a picture by a camera [px]."""
+    surface, image = _get(data, "sheet", "surface"), data.get("image")
+    if not isinstance(image, str) or (_get(surface, "depth") is None and _get(surface, "picture") is None):
+        return None
+    try:
+        return picture_size(image)
+    except PictureError:
+        return None  # It is reported with the image.
+
+
+def complete_framed(data: Mapping[str, Any], size: tuple[int, int]) -> Mapping[str, Any]:
+    """Add to the sections of a scene the size of its pictures, and the pose of the camera of a depth map."""
+    render, depth = data.get("render", {}), _get(data, "sheet", "surface", "depth")
+    if not isinstance(render, Mapping):
+        return data
+    render = {"size": size, **render}
+    cameras = render.get("cameras")
+    if depth is not None and isinstance(render.get("camera"), Mapping):
+        render["camera"] = _at_origin(render["camera"])
+    if depth is not None and isinstance(cameras, Mapping) and cameras:
+        name = _get(depth, "camera") or next(iter(cameras))
+        if isinstance(cameras.get(name), Mapping):
+            render["cameras"] = {**cameras, name: _at_origin(cameras[name])}
+    return {**data, "render": render}
+
+
+def _at_origin(camera: Mapping[str, Any]) -> Mapping[str, Any]:
+    """Return a camera with a pose."""
+    return camera if {"eye", "pose", "poses", "beside"} & camera.keys() else {**camera, "pose": POSE_AT_ORIGIN}
+
+
+def _get(data: Any, *names: str) -> Any:
+    """Return a value in mappings and sections."""
+    for name in names:
+        data = data.get(name) if isinstance(data, Mapping) else getattr(data, name, None)
+    return data
+
+
+def frame_sheet(
+    sheet: Sheet, render: Render, size: tuple[int, int] | None, region: tuple[int, int, int, int] | None
+) -> Sheet:
+    """Return a sheet whose surface has its `Frame`, for the image's size [px] and region."""
+    surface = sheet.surface
+    if surface is None or surface.frame_key is None:
+        return sheet
+    name = surface.depth.camera if surface.depth else surface.picture
+    key = ("sheet", "surface", *surface.frame_key)
+    if size is None:
+        raise scene_fault("needs image, the picture that the camera took", *key[:-1])
+    (width, height), (image_width, image_height) = render.size, size
+    if width * image_height != height * image_width:
+        text = f"{width} x {height} has another aspect than the image, {image_width} x {image_height}"
+        raise scene_fault(f"{text}; take {[image_width, image_height]} or a multiple", "render", "size")
+    cameras = _chain(render, name, key)
+    points = surface.frame.points if surface.frame and surface.frame.is_kept else sheet.points
+    is_kept = bool(surface.frame and surface.frame.is_kept)
+    frame = Frame(cameras, size, region or (0, 0, *size), points, is_kept)
+    return sheet if frame == surface.frame else sheet.model_copy(update={"surface": surface.with_frame(frame)})
+
+
+def _chain(render: Render, name: str | None, key: tuple[str, ...]) -> tuple[Camera, ...]:
+    """Return a camera, the one that it is `beside`, and so on."""
+    cameras, chain = render.all_cameras, []
+    if name == MAIN and MAIN not in cameras:
+        name = render.main
+    current = render.main if name is None else name
+    if current not in cameras:
+        known = ", ".join(filter(None, cameras)) or f"{MAIN}, as render.cameras is missing"
+        raise scene_fault(f"{current} is not one of render.cameras; take {known}", *key)
+    while True:
+        camera = cameras[current]
+        if not isinstance(camera, Camera):
+            remedy = "give it intrinsics, a calibration or fov"
+            raise scene_fault(f"the camera is {camera}, which took no picture; {remedy}", *key)
+        chain.append(camera)
+        if camera.beside is None:
+            break
+        current = camera.beside
+    if not any(camera.has_own_lens for camera in chain):
+        text = "the camera has no lens; add intrinsics, calibration or fov to it"
+        raise scene_fault(text, *key)
+    return tuple(chain)
