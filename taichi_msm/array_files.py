@@ -31,9 +31,9 @@ MEMORY_FACTOR = 4
 
 @dataclass(frozen=True, eq=False)
 class ArrayFile:
-    """Numbers of a file in metres, compared by identity, as sections of scenes keep it and arrays have no one ==."""
+    """Numbers of a file, in metres except of depth maps, compared by identity, as arrays have no one ==."""
 
-    values: NDArray[Any]  # float64
+    values: NDArray[Any]  # float64, of depth maps as in the file
     sha256: str  # of the file
     step: float  # the values are multiples of it, but for an offset [m]; 0 for floating-point numbers
 

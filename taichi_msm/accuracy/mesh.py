@@ -280,7 +280,8 @@ class MeshCompanion:
 
 def with_points(scene: Scene, points: tuple[int, int]) -> Scene:
     """Return a copy of a scene with another mesh, (rows, cols), and without `sheet.tolerance`."""
-    return scene.model_copy(update={"sheet": scene.sheet.model_copy(update={"points": points, "tolerance": None})})
+    sheet = scene.sheet.model_copy(update={"points": points, "tolerance": None})
+    return scene.model_copy(update={"sheet": sheet.with_kept_grid()})
 
 
 def choose_points(

@@ -9,8 +9,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from taichi_msm.arithmetic import Array
-from taichi_msm.cameras.extrinsics import OPENCV_SIGNS, Extrinsics, nearest_rotation
+from taichi_msm.camera_files.calibration import Calibration
+from taichi_msm.cameras.extrinsics import OPENCV_SIGNS, Extrinsics, extrinsics, nearest_rotation
 from taichi_msm.cameras.lens import IDENTITY_LENS, Lens
+from taichi_msm.lenses import MODELS
 from taichi_msm.scene.camera import Camera
 from taichi_msm.scene.render import AnyCamera
 
@@ -96,8 +98,19 @@ class View(NamedTuple):
         return self._replace(matrix=matrix)
 
 
-def pinhole_view(camera: Camera, size: Sequence[float] | Array, placement: Extrinsics, near: float) -> View:
-    """Return the view of a pinhole camera, for width and height of the picture [px] and the near plane [m]."""
+def pinhole_view(
+    camera: Camera,
+    size: Sequence[float] | Array,
+    placement: Extrinsics,
+    near: float,
+    calibrated: Sequence[float] | None = None,
+) -> View:
+    """Return the view of a pinhole camera, for width and height of the picture [px] and the near plane [m].
+
+    Intrinsics and lens are those of a picture of the size `calibrated` [px], by default that of the picture.
+    """
+    if calibrated is not None and tuple(calibrated) != tuple(size):
+        camera = _resized(camera, size[0] / calibrated[0], size[1] / calibrated[1])
     (width_px, height_px), (eye, axes, distance) = size, placement
     right, up, toward = axes
     depth = -toward
@@ -116,14 +129,32 @@ def pinhole_view(camera: Camera, size: Sequence[float] | Array, placement: Extri
     return View(matrix, near, axes, eye, scale, centre, np.array(size, float), distance, pinhole=True, lens=lens)
 
 
-def companion_view(camera: Camera, reference: View, near: float) -> View:
+def _resized(camera: Camera, scale_x: float, scale_y: float) -> Camera:
+    """Return the camera for pictures resized edge to edge, by factors of their width and height."""
+    if camera.intrinsics is None:
+        return camera
+    lens = camera.distortion
+    model, names = (lens.model, MODELS[lens.model].coefficients) if lens else ("pinhole", ())
+    given = {name: getattr(lens, name) for name in names}
+    centre = (camera.intrinsics.cx, camera.intrinsics.cy)
+    scaled = Calibration(camera.focal_lengths, centre, None, model, given).scaled(scale_x, scale_y)
+    (fx, fy), (cx, cy) = scaled.focal or (0.0, 0.0), scaled.centre
+    update: dict[str, Any] = {"intrinsics": {"fx": fx, "fy": fy, "cx": cx, "cy": cy}}
+    if lens and lens.focal_length:
+        update["intrinsics"] = {"cx": cx, "cy": cy}
+    if lens:
+        update["distortion"] = {"model": model, **scaled.coefficients}
+    return camera.model_copy(update=update)
+
+
+def companion_view(camera: Camera, reference: View, near: float, calibrated: Sequence[float] | None = None) -> View:
     """Return the view of a camera posed relative to a reference camera: X_this = R X_reference + T."""
     rotation, translation = (np.array(pair_transform(camera)[key]) for key in ("rotation", "translation"))
     world_to_reference = reference.axes * OPENCV_SIGNS
     axes = rotation @ world_to_reference * OPENCV_SIGNS
     eye = reference.eye - world_to_reference.T @ rotation.T @ translation
     if camera.has_own_lens:
-        return pinhole_view(camera, reference.size, Extrinsics(eye, axes, reference.distance), near)
+        return pinhole_view(camera, reference.size, Extrinsics(eye, axes, reference.distance), near, calibrated)
     # Keep the optics of the reference camera: move the world instead of the camera.
     world_rotation, world_motion = reference.axes.T @ axes, np.eye(4)
     world_motion[:3, :3], world_motion[:3, 3] = world_rotation, reference.eye - world_rotation @ eye
@@ -142,3 +173,12 @@ def pair_transform(camera: AnyCamera) -> dict[str, Any]:
     if camera.rotation is not None and camera.translation is not None:
         rotation, translation = nearest_rotation(np.array(camera.rotation)), list(camera.translation)
     return {"beside": camera.beside, "rotation": rotation.tolist(), "translation": translation}
+
+
+def first_view(cameras: Sequence[Camera], size: Sequence[float]) -> View:
+    """Return the view at the start of the first of some cameras, each of which is `beside` the next."""
+    *beside, origin = cameras
+    view = pinhole_view(origin, size, extrinsics(origin, 0.0), 0.0)
+    for camera in reversed(beside):
+        view = companion_view(camera, view, 0.0)
+    return view

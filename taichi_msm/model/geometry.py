@@ -9,6 +9,7 @@ from __future__ import annotations
 import math
 from abc import ABC, abstractmethod
 from functools import cached_property
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -177,11 +178,19 @@ class FlatRest(Rest):
         return np.hypot(x - at_x, y - at_y)
 
 
+class Origin(NamedTuple):
+    """The part of a file in the positions of a curved sheet."""
+
+    grid: Array | None = None  # even grid, fractions of the file across and down, shape (rows, cols, 2)
+    filled: float = 0.0  # share of pixels without depth
+    deviation: float | None = None  # standard deviation of the smoothing [px]
+
+
 class CurvedRest(Rest):
     """Mass points anywhere in space."""
 
-    def __init__(self, position: Array, mask: Mask | None = None) -> None:
-        self.position, self.mask = position, mask
+    def __init__(self, position: Array, mask: Mask | None = None, origin: Origin | None = None) -> None:
+        self.position, self.mask, self.origin = position, mask, origin or Origin()
         self.position.flags.writeable = False
         self.cells = Cells.of(position)
         present = self.present

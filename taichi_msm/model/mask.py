@@ -20,18 +20,10 @@ class Mask:
     cells: NDArray[np.bool_]
 
     @classmethod
-    def sample(cls, is_sheet: NDArray[np.bool_], across: Array, down: Array) -> Mask:
-        """Sample pixels at the middle of cells, fractions of the picture from left and top, by the nearest pixel."""
-        height, width = is_sheet.shape
-        column = np.clip((across * width).astype(int), 0, width - 1)
-        row = np.clip((down * height).astype(int), 0, height - 1)
-        return cls(is_sheet[row, column])
-
-    @classmethod
     def at_cells(cls, is_sheet: NDArray[np.bool_], points: tuple[int, int]) -> Mask:
         """Sample pixels at the middle of the cells of an even grid of (rows, cols) mass points."""
         rows, cols = points[0] - 1, points[1] - 1
-        return cls.sample(is_sheet, (np.arange(cols) + 0.5) / cols, ((np.arange(rows) + 0.5) / rows)[:, None])
+        return cls(sample_nearest(is_sheet, (np.arange(cols) + 0.5) / cols, ((np.arange(rows) + 0.5) / rows)[:, None]))
 
     @cached_property
     def cell_counts(self) -> NDArray[np.int_]:
@@ -68,3 +60,11 @@ class Mask:
         ):
             for row, column in np.argwhere((a > 0) & (b > 0) & (a != b)) + 1:
                 yield int(row), int(column)
+
+
+def sample_nearest(is_sheet: NDArray[np.bool_], across: Array, down: Array) -> NDArray[np.bool_]:
+    """Return the nearest pixels at fractions from left and top, which broadcast; False where they are NaN."""
+    height, width = is_sheet.shape
+    column = np.clip(np.nan_to_num(across * width).astype(int), 0, width - 1)
+    row = np.clip(np.nan_to_num(down * height).astype(int), 0, height - 1)
+    return np.asarray(is_sheet[row, column] & np.isfinite(across) & np.isfinite(down))

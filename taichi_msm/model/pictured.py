@@ -14,14 +14,17 @@ from numpy.typing import NDArray
 
 from taichi_msm.arithmetic import Array
 from taichi_msm.cameras.view import View
-from taichi_msm.model.geometry import CurvedRest
+from taichi_msm.model.geometry import CurvedRest, Origin
 from taichi_msm.model.mask import Mask
 
 # Cells near a place that are tried before all others.
 NEAR_CELLS = 32
 
-# Newton's steps to the coordinates of a place in a cell, which are within [0, 1] up to TOLERANCE.
-NEWTON_STEPS, TOLERANCE = 20, 1e-9
+# Largest distance of s and t from 0 to 1 in the cell of a place.
+TOLERANCE = 1e-9
+
+# Number of times that the outermost cell of a place beyond the picture is chosen.
+CONTINUATIONS = 4
 
 # Share of the way to a place beyond the picture over which the map of the camera is linearised.
 LINEAR_STEP = 1e-3
@@ -33,6 +36,11 @@ class Picture:
 
     view: View  # of the image, at the start
     region: tuple[int, int, int, int]  # x, y, width and height [px]
+
+    @property
+    def key(self) -> tuple[object, ...]:
+        """Values that determine the map from the world to pixels."""
+        return (self.view.matrix.tolist(), self.view.lens, self.view.scale.tolist(), self.view.centre.tolist())
 
     def pixels(self, fractions: Array) -> Array:
         """Return the undistorted pixels at fractions of the picture, shape (..., 2) each; NaN beyond the lens."""
@@ -59,8 +67,8 @@ class Picture:
 class PicturedRest(CurvedRest):
     """Mass points in space with the picture of a camera; coordinates are fractions of the picture across and down."""
 
-    def __init__(self, position: Array, mask: Mask | None, picture: Picture) -> None:
-        super().__init__(position, mask)
+    def __init__(self, position: Array, mask: Mask | None, picture: Picture, origin: Origin) -> None:
+        super().__init__(position, mask, origin)
         self.picture = picture
         self._projected = picture.project(position)
         # The last argument and result of `mesh_places`.
@@ -103,47 +111,64 @@ class PicturedRest(CurvedRest):
         for n in np.flatnonzero(misses > TOLERANCE):
             # Of slender cells, whose middles are far; and without sheet, where the nearest cell is continued.
             s_t[n], cells[n], _ = (each[0] for each in self._nearest(pixels[n : n + 1], present[None]))
+        counts = np.array(self.position.shape[1::-1]) - 1
+        place = s_t + cells[:, ::-1]
         if (beyond := (inside != fractions).any(axis=1)).any():
-            s_t[beyond] = self._continue(fractions[beyond], inside[beyond], cells[beyond], s_t[beyond])
-        rows, cols = self.position.shape[:2]
-        return np.asarray((s_t + cells[:, ::-1]) / (cols - 1, rows - 1))
+            for _ in range(CONTINUATIONS):
+                column, row = np.clip(np.floor(place[beyond]).astype(int), 0, counts - 1).T
+                cell = np.stack([row, column], axis=1)
+                start = place[beyond] - cell[:, ::-1]
+                place[beyond] = cell[:, ::-1] + self._continue(fractions[beyond], inside[beyond], cell, start)
+        return np.asarray(place / counts)
 
     def _nearest(self, pixels: Array, cells: NDArray[np.int_]) -> tuple[Array, NDArray[np.int_], Array]:
         """Find undistorted pixels, shape (n, 2), each in one of its cells, shape (n, k, 2).
 
         Return s and t, shape (n, 2), the cell, shape (n, 2), and the distance of (s, t) from the cell, shape (n,).
         """
-        s_t, depth = self._solve(pixels[:, None], cells, np.full((*cells.shape[:2], 2), 0.5))
+        s_t, depth = self._solve(pixels[:, None], cells)
         miss = np.abs(s_t - np.clip(s_t, 0, 1)).max(axis=-1)
-        miss = np.where((depth > 0) & np.isfinite(miss), miss, np.inf)
-        hit = miss <= TOLERANCE
+        miss = np.where((depth > 0) & np.isfinite(miss), miss, np.inf).reshape(len(pixels), -1)
+        hit, depth = miss <= TOLERANCE, depth.reshape(miss.shape)
         best = np.where(hit.any(axis=1), np.where(hit, depth, np.inf).argmin(axis=1), miss.argmin(axis=1))
         rows = np.arange(len(pixels))
-        return s_t[rows, best], cells[rows, best], miss[rows, best]
+        return s_t.reshape(*miss.shape, 2)[rows, best], cells[rows, best // 2], miss[rows, best]
 
-    def _solve(self, pixels: Array, cells: NDArray[np.int_], start: Array) -> tuple[Array, Array]:
-        """Return s and t of undistorted pixels in cells, shape (..., 2) each, and h_z there, by Newton's method."""
+    def _solve(self, pixels: Array, cells: NDArray[np.int_]) -> tuple[Array, Array]:
+        """Return both s and t of undistorted pixels in cells, shape (..., 2, 2) from (..., 2), and h_z, (..., 2)."""
         h, (i, j) = self._projected, np.moveaxis(cells, -1, 0)
-        a = h[i, j]
-        b, c = h[i, j + 1] - a, h[i + 1, j] - a
-        d = h[i + 1, j + 1] - a - b - c
-        s, t = np.moveaxis(start, -1, 0)
-        # The equations h_x - x h_z = 0 and h_y - y h_z = 0.
-        (a_x, b_x, c_x, d_x), (a_y, b_y, c_y, d_y) = (
-            [k[..., n] - pixels[..., n] * k[..., 2] for k in (a, b, c, d)] for n in (0, 1)
-        )
+        corner = h[i, j]
+        right, down = h[i, j + 1] - corner, h[i + 1, j] - corner
+        twist = h[i + 1, j + 1] - corner - right - down
+        # h_x - x h_z = 0 and h_y - y h_z = 0 are a + b s + c t + d s t = 0, so a + b s and c + d s are parallel.
+        a, b, c, d = (each[..., :2] - pixels * each[..., 2:] for each in (corner, right, down, twist))
+        square, linear, constant = _cross(b, d), _cross(a, d) + _cross(b, c), _cross(a, c)
         with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
-            for _ in range(NEWTON_STEPS):
-                f, g = a_x + b_x * s + c_x * t + d_x * s * t, a_y + b_y * s + c_y * t + d_y * s * t
-                f_s, f_t, g_s, g_t = b_x + d_x * t, c_x + d_x * s, b_y + d_y * t, c_y + d_y * s
-                determinant = f_s * g_t - f_t * g_s
-                s, t = s - (f * g_t - g * f_t) / determinant, t - (f_s * g - g_s * f) / determinant
-            return np.stack([s, t], axis=-1), a[..., 2] + b[..., 2] * s + c[..., 2] * t + d[..., 2] * s * t
+            q = -(linear + np.copysign(np.sqrt(linear * linear - 4 * square * constant), linear)) / 2
+            s = np.stack([q / square, constant / q], axis=-1)
+            across, along = (
+                each[..., None, :] + other[..., None, :] * s[..., None] for each, other in ((a, b), (c, d))
+            )
+            t = -(across * along).sum(axis=-1) / (along * along).sum(axis=-1)
+            depth = corner[..., 2:] + right[..., 2:] * s + down[..., 2:] * t + twist[..., 2:] * s * t
+        return np.stack([s, t], axis=-1), depth
 
     def _continue(self, fractions: Array, inside: Array, cells: NDArray[np.int_], start: Array) -> Array:
         """Return s and t of places beyond the picture in the cells of the nearest places, whose s and t are given."""
-        s_t, depth = self._solve(self.picture.pixels(fractions), cells, start)
+
+        def nearest_root(places: Array) -> tuple[Array, NDArray[np.bool_]]:
+            s_t, depth = self._solve(self.picture.pixels(places), cells)
+            change = np.abs(s_t - start[:, None]).max(axis=-1)
+            change = np.where((depth > 0) & np.isfinite(change), change, np.inf)
+            best, rows = change.argmin(axis=1), np.arange(len(places))
+            return s_t[rows, best], np.isfinite(change[rows, best])
+
+        s_t, is_seen = nearest_root(fractions)
         # Where the lens sees nothing, the map is continued linearly.
-        back, _ = self._solve(self.picture.pixels(inside + LINEAR_STEP * (inside - fractions)), cells, start)
-        is_seen = np.isfinite(s_t).all(axis=1) & (depth > 0)
+        back, _ = nearest_root(inside + LINEAR_STEP * (inside - fractions))
         return np.where(is_seen[:, None], s_t, start + (start - back) / LINEAR_STEP)
+
+
+def _cross(a: Array, b: Array) -> Array:
+    """Return the vector product of vectors in a plane, shape (...) from (..., 2)."""
+    return a[..., 0] * b[..., 1] - a[..., 1] * b[..., 0]

@@ -10,10 +10,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from taichi_msm.arithmetic import Array
-from taichi_msm.model.geometry import CurvedRest, FlatRest, Rest
-from taichi_msm.model.mask import Mask
+from taichi_msm.cameras.view import first_view
+from taichi_msm.model.depth import depth_positions
+from taichi_msm.model.geometry import CurvedRest, FlatRest, Origin, Rest
+from taichi_msm.model.grids import kept_grid
+from taichi_msm.model.mask import Mask, sample_nearest
+from taichi_msm.model.pictured import Picture, PicturedRest
 from taichi_msm.scene.sheet import Sheet, SheetMask
 from taichi_msm.scene.surface import Dome, HeightField, PointGrid, RestSurface, Tube
+from taichi_msm.surfaces.surface import point_surface, positions
 
 
 def rest_of(sheet: Sheet) -> Rest:
@@ -43,11 +48,30 @@ def _rest(
     mask: SheetMask | None,
     sha256: tuple[str, str],  # noqa: ARG001  # of the files, part of the key of the cache
 ) -> Rest:
-    sampled = None if mask is None else Mask.at_cells(mask.pixels.is_sheet, points)
-    flat = FlatRest(points, size, sampled)
+    is_sheet = None if mask is None else mask.pixels.is_sheet
+    sampled = None if is_sheet is None else Mask.at_cells(is_sheet, points)
     if surface is None:
-        return flat
-    return CurvedRest(KINDS[surface.kind](getattr(surface, surface.kind), flat.position), sampled)
+        return FlatRest(points, size, sampled)
+    frame, origin = surface.frame, Origin()
+    picture = Picture(first_view(frame.cameras, frame.image_size), frame.region) if frame and frame.cameras else None
+    if surface.depth:
+        assert frame is not None
+        assert picture is not None
+        position, origin = depth_positions(surface.depth, frame, picture, points, mask, even=surface.is_even)
+    elif surface.points and surface.is_even:
+        assert frame is not None
+        values, sha256_of_file = surface.points.points.values, surface.points.points.sha256
+        on_file = point_surface(values)
+        grid = kept_grid(on_file, frame.points, points, (sha256_of_file, surface.points.unit))
+        position, origin = positions(on_file, grid), Origin(grid)
+    else:
+        position = KINDS[surface.kind](getattr(surface, surface.kind), FlatRest(points, size).position)
+    if picture is None:
+        return CurvedRest(position, sampled, origin)
+    if is_sheet is not None:
+        across, down = np.moveaxis(picture.at_cells(position), -1, 0)
+        sampled = Mask(sample_nearest(is_sheet, across, down))
+    return PicturedRest(position, sampled, picture, origin)
 
 
 def _height_positions(field: HeightField, flat: Array) -> Array:
@@ -86,7 +110,7 @@ def _point_positions(grid: PointGrid, flat: Array) -> Array:
     return positions
 
 
-# Positions of the mass points [m] of each kind of surface, from those of the flat sheet, shape (rows, cols, 3) each.
+# Positions of the mass points [m] of each kind, from those of the flat sheet, shape (rows, cols, 3) each.
 KINDS: dict[str, Callable[[Any, Array], Array]] = {
     "height": _height_positions,
     "tube": _tube_positions,

@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 
 from taichi_msm.arithmetic import NUMPY, Array
 from taichi_msm.errors import Problem
-from taichi_msm.model.geometry import Rest
+from taichi_msm.model.geometry import CurvedRest, Rest
 from taichi_msm.model.rest import rest_of
 from taichi_msm.model.sheet import SIDES, fixed_points, fixed_sides, rest_positions
 from taichi_msm.model.time_grid import TimeGrid
@@ -196,7 +196,9 @@ class SolidTool(Tool):
         """Return points of a curved sheet, some radii or a tenth of a cell apart; None for a flat one."""
         rest = rest_of(sheet)
         most = min(9, math.isqrt(MAX_POINTS_BETWEEN // math.prod(sheet.points)) - 1)
-        return None if rest.is_flat else rest.refined(max(0, min(most, int(rest.longest_side / (radii * self.radius)))))
+        if not isinstance(rest, CurvedRest):
+            return None
+        return rest.refined(max(0, min(most, int(rest.longest_side / (radii * self.radius)))))
 
     def problems(self, scene: Scene, grid: TimeGrid) -> Iterator[Problem]:
         points = self.points_between(scene.sheet)

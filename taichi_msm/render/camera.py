@@ -97,7 +97,7 @@ def _view_of(scene: Scene, time: float, name: str) -> View:
     if camera == "top":
         result = _top(scene)
     elif isinstance(camera, Camera) and camera.beside is not None:
-        result = companion_view(camera, _view_of(scene, time, camera.beside), _near(scene))
+        result = companion_view(camera, _view_of(scene, time, camera.beside), _near(scene), scene.calibrated_size)
     else:
         preset = camera if isinstance(camera, Camera) else PRESET_CAMERAS[camera](scene)
         result = _pinhole(aim_camera(preset, scene), scene, time)
@@ -201,7 +201,7 @@ def _extrinsics_problems(camera: Camera, scene: Scene) -> Iterator[Problem]:
             if begin <= tolerance:
                 remedy = "shorten time.duration or add poses up to its end"
             yield Problem(key, f"{message}; {remedy}")
-    if camera.eye is None and extrinsics(camera, 0.0).distance < MIN_MAGNITUDE:
+    if camera.eye is None and _distance(camera, scene) < MIN_MAGNITUDE:
         message = "puts the eye at the centre of the sheet, so the light has no distance from it; move the eye away"
         yield Problem(key, message)
     rate = scene.time.frames_per_second
@@ -330,8 +330,16 @@ def _top(scene: Scene) -> View:
 def _pinhole(camera: Camera, scene: Scene, time: float) -> View:
     placement = extrinsics(camera, time)
     # The distance is that at the start, so the light of a moving camera keeps its intensity.
-    placement = placement._replace(distance=extrinsics(camera, 0.0).distance)
-    return pinhole_view(camera, scene.render.size, placement, _near(scene))
+    placement = placement._replace(distance=_distance(camera, scene))
+    return pinhole_view(camera, scene.render.size, placement, _near(scene), scene.calibrated_size)
+
+
+def _distance(camera: Camera, scene: Scene) -> float:
+    """Return the distance at the start from the eye to the target, of a pose to the middle of the sheet [m]."""
+    eye, _, distance = extrinsics(camera, 0.0)
+    if camera.eye is None and scene.calibrated_size:
+        return math.dist(eye, _middle(scene))
+    return distance
 
 
 def _near(scene: Scene) -> float:

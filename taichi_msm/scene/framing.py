@@ -63,8 +63,13 @@ def frame_sheet(
 ) -> Sheet:
     """Return a sheet whose surface has its `Frame`, for the image's size [px] and region."""
     surface = sheet.surface
-    if surface is None or surface.frame_key is None:
+    if surface is None:
         return sheet
+    is_kept = bool(surface.frame and surface.frame.is_kept)
+    points = surface.frame.points if surface.frame and is_kept else sheet.points
+    if surface.frame_key is None:
+        frame = Frame((), (0, 0), (0, 0, 0, 0), points, is_kept) if surface.is_even else None
+        return sheet if frame == surface.frame else sheet.model_copy(update={"surface": surface.with_frame(frame)})
     name = surface.depth.camera if surface.depth else surface.picture
     key = ("sheet", "surface", *surface.frame_key)
     if size is None:
@@ -74,8 +79,6 @@ def frame_sheet(
         text = f"{width} x {height} has another aspect than the image, {image_width} x {image_height}"
         raise scene_fault(f"{text}; take {[image_width, image_height]} or a multiple", "render", "size")
     cameras = _chain(render, name, key)
-    points = surface.frame.points if surface.frame and surface.frame.is_kept else sheet.points
-    is_kept = bool(surface.frame and surface.frame.is_kept)
     frame = Frame(cameras, size, region or (0, 0, *size), points, is_kept)
     return sheet if frame == surface.frame else sheet.model_copy(update={"surface": surface.with_frame(frame)})
 
@@ -95,6 +98,8 @@ def _chain(render: Render, name: str | None, key: tuple[str, ...]) -> tuple[Came
             remedy = "give it intrinsics, a calibration or fov"
             raise scene_fault(f"the camera is {camera}, which took no picture; {remedy}", *key)
         chain.append(camera)
+        if camera.eye is not None and "target" not in camera.model_fields_set:
+            raise scene_fault("the camera has no target, and the surface follows from its direction; add target", *key)
         if camera.beside is None:
             break
         current = camera.beside

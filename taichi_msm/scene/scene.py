@@ -145,6 +145,12 @@ class Scene(Section):
     )
 
     @property
+    def calibrated_size(self) -> tuple[int, int] | None:
+        """Width and height of the image to which the cameras refer [px]; None: the pictures."""
+        frame = self.sheet.surface.frame if self.sheet.surface else None
+        return frame.image_size if frame and frame.cameras else None
+
+    @property
     def folders(self) -> dict[str, tuple[str, ...]]:
         """Names of the outputs by folder: a folder for each camera, and "" for the run."""
         selected = [output for output in OUTPUTS.values() if output.entry in self.output]

@@ -199,6 +199,13 @@ class Sheet(Section):
             changes["mask"] = self.mask.model_copy(update={"image": path(self.mask.image)})
         return self.model_copy(update=changes) if changes else self
 
+    def with_kept_grid(self) -> Sheet:
+        """Return a copy for another mesh, which keeps smoothing and even grid of a surface from a file."""
+        if self.surface is None or self.surface.frame is None:
+            return self
+        frame = self.surface.frame._replace(is_kept=True)
+        return self.model_copy(update={"surface": self.surface.with_frame(frame)})
+
     @property
     def unit_hint(self) -> str:
         """Warning about a size that is probably in millimetres; empty for a sheet of up to 5 m."""

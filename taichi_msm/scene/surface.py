@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Collection
-from dataclasses import dataclass
 from functools import cached_property
-from typing import TYPE_CHECKING, Annotated, Any, Literal, NamedTuple
+from typing import TYPE_CHECKING, Annotated, Literal, NamedTuple
 
 from pydantic import AfterValidator, ConfigDict, Field, PrivateAttr, model_validator
 from typing_extensions import Self
@@ -16,7 +15,7 @@ from taichi_msm.scene.camera import Camera
 from taichi_msm.scene.section import FilePath, NotNegative, Number, Positive, Section, key, scene_fault
 
 if TYPE_CHECKING:
-    from numpy.typing import NDArray
+    pass
 
 METRES = {"m": 1.0, "mm": 1e-3, "um": 1e-6}
 
@@ -108,15 +107,6 @@ class Dome(Section):
     radius: Radius = key(..., "radius [m]; below 0 for a bowl", "a number other than 0, in metres")
 
 
-@dataclass(frozen=True, eq=False)
-class DepthFile:
-    """A depth map, compared by identity."""
-
-    depth: NDArray[Any]  # [m], NaN where there is none, shape (h, w)
-    sha256: str  # of the file
-    step: float  # the depths are multiples of it, but for an offset [m]; 0 for floating-point numbers
-
-
 class DepthMap(Section):
     """Depth of every pixel of the image, seen by a camera."""
 
@@ -141,10 +131,8 @@ class DepthMap(Section):
     )
 
     @cached_property
-    def depths(self) -> DepthFile:
-        """Depths, read once; a PictureError if the file cannot be used."""
-        import numpy as np
-
+    def numbers(self) -> ArrayFile:
+        """Numbers of the file as they are, shape (h, w), read once; a PictureError if it cannot be used."""
         if self.file.lower().endswith(PICTURE_SUFFIXES):
             sha256 = file_sha256(self.file)
             values = read_depth(self.file, sha256)
@@ -156,10 +144,12 @@ class DepthMap(Section):
                 "(h, w) or (h, w, 3)",
             )
             values = values[..., 2] if values.ndim == 3 else values
-        largest = np.iinfo(values.dtype).max if values.dtype.kind in "iu" else np.inf
-        is_depth = (values > 0) & (values < largest)
-        depth = np.where(is_depth, values, np.nan).astype(np.float64) * metres(self.unit)
-        return DepthFile(depth, sha256, metres(self.unit) * (quantum(values[is_depth]) if is_depth.any() else 0.0))
+        return ArrayFile(values, sha256, self.metres * quantum(values))
+
+    @property
+    def metres(self) -> float:
+        """Unit of the file [m]."""
+        return metres(self.unit)
 
 
 class PointGrid(Section):
@@ -235,7 +225,7 @@ class RestSurface(Section):
     def with_frame(self, frame: Frame | None) -> RestSurface:
         """Return a copy with another frame."""
         surface = self.model_copy()
-        surface.__pydantic_private__ = {"_frame": frame}
+        object.__setattr__(surface, "__pydantic_private__", {"_frame": frame})
         return surface
 
     @property
@@ -268,11 +258,11 @@ class RestSurface(Section):
         return self.height or self.depth or self.points
 
     @cached_property
-    def file(self) -> ArrayFile | DepthFile | None:
+    def file(self) -> ArrayFile | None:
         """Content of the file, read once; None for a kind without one, and a PictureError if it cannot be used."""
         if self.height:
             return self.height.heights
-        return self.depth.depths if self.depth else self.points.points if self.points else None
+        return self.depth.numbers if self.depth else self.points.points if self.points else None
 
     @property
     def file_key(self) -> tuple[str, ...]:

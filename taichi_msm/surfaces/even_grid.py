@@ -175,9 +175,9 @@ def inverse_hessian(surface: Surface, p: Array) -> Callable[[Array], Array]:
         half[[0, -1]] = 0.5
         one, two = np.pi * np.arange(1, n - 1) / (n - 1), np.pi * np.arange(m) / (m - 1)
         eigenvalues = (2 - 2 * np.cos(one))[:, None] * weights[0] + (2 - 2 * np.cos(two)) * weights[1]
-        spectrum = dct(dst(values[1:-1] , 1, axis=0, norm="ortho") / half, 1) / eigenvalues
+        spectrum = dct(dst(values[1:-1], 1, axis=0, norm="ortho") / half, 1) / eigenvalues
         solution = np.zeros_like(values)
-        solution[1:-1] = dst(dct(spectrum, 1), 1, axis=0, norm="ortho") / (2*(m - 1))
+        solution[1:-1] = dst(dct(spectrum, 1), 1, axis=0, norm="ortho") / (2 * (m - 1))
         return solution
 
     def apply(slope: Array) -> Array:

@@ -21,8 +21,7 @@ class GridSpline:
     def __call__(self, row: Array, column: Array) -> tuple[Array, Array, Array]:
         """Return values and their derivatives by row and by column, shape (k, ...) each, at k places."""
         i, j = (
-            np.clip(np.floor(at).astype(int), 0, count - 2)
-            for at, count in zip((row, column), self.shape, strict=True)
+            np.clip(np.floor(at).astype(int), 0, count - 2) for at, count in zip((row, column), self.shape, strict=True)
         )
         four = np.arange(4)
         near = self._coefficients[(i[:, None] + four)[:, :, None], (j[:, None] + four)[:, None, :]]
