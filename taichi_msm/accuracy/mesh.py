@@ -281,7 +281,7 @@ class MeshCompanion:
 def with_points(scene: Scene, points: tuple[int, int]) -> Scene:
     """Return a copy of a scene with another mesh, (rows, cols), and without `sheet.tolerance`."""
     sheet = scene.sheet.model_copy(update={"points": points, "tolerance": None})
-    return scene.model_copy(update={"sheet": sheet.with_kept_grid()})
+    return scene.model_copy(update={"sheet": sheet.with_kept_frame()})
 
 
 def choose_points(

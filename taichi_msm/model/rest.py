@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from taichi_msm.arithmetic import Array
 from taichi_msm.cameras.view import first_view
+from taichi_msm.images import PictureError
 from taichi_msm.model.depth import depth_positions
 from taichi_msm.model.geometry import CurvedRest, FlatRest, Origin, Rest
 from taichi_msm.model.grids import kept_grid
@@ -54,6 +55,8 @@ def _rest(
         return FlatRest(points, size, sampled)
     frame, origin = surface.frame, Origin()
     picture = Picture(first_view(frame.cameras, frame.image_size), frame.region) if frame and frame.cameras else None
+    if surface.frame_key and picture is None:
+        raise PictureError("its picture, image, cannot be read", "name the picture that the camera took")
     if surface.depth:
         assert frame is not None
         assert picture is not None

@@ -59,27 +59,34 @@ def _get(data: Any, *names: str) -> Any:
 
 
 def frame_sheet(
-    sheet: Sheet, render: Render, size: tuple[int, int] | None, region: tuple[int, int, int, int] | None
+    sheet: Sheet,
+    render: Render,
+    image: str | None,
+    size: tuple[int, int] | None,
+    region: tuple[int, int, int, int] | None,
 ) -> Sheet:
-    """Return a sheet whose surface has its `Frame`, for the image's size [px] and region."""
+    """Return a sheet whose surface has its `Frame`, for the image, its size [px] and region.
+
+    A kept frame stays as it is; without the size of the image there is none.
+    """
     surface = sheet.surface
-    if surface is None:
+    if surface is None or (surface.frame and surface.frame.is_kept):
         return sheet
-    is_kept = bool(surface.frame and surface.frame.is_kept)
-    points = surface.frame.points if surface.frame and is_kept else sheet.points
     if surface.frame_key is None:
-        frame = Frame((), (0, 0), (0, 0, 0, 0), points, is_kept) if surface.is_even else None
+        frame = Frame((), (0, 0), (0, 0, 0, 0), sheet.points) if surface.is_even else None
         return sheet if frame == surface.frame else sheet.model_copy(update={"surface": surface.with_frame(frame)})
     name = surface.depth.camera if surface.depth else surface.picture
     key = ("sheet", "surface", *surface.frame_key)
     if size is None:
-        raise scene_fault("needs image, the picture that the camera took", *key[:-1])
+        if image is None:
+            raise scene_fault("needs image, the picture that the camera took", *key[:-1])
+        return sheet  # The file of the image is reported.
     (width, height), (image_width, image_height) = render.size, size
     if width * image_height != height * image_width:
         text = f"{width} x {height} has another aspect than the image, {image_width} x {image_height}"
         raise scene_fault(f"{text}; take {[image_width, image_height]} or a multiple", "render", "size")
     cameras = _chain(render, name, key)
-    frame = Frame(cameras, size, region or (0, 0, *size), points, is_kept)
+    frame = Frame(cameras, size, region or (0, 0, *size), sheet.points)
     return sheet if frame == surface.frame else sheet.model_copy(update={"surface": surface.with_frame(frame)})
 
 

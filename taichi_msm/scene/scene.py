@@ -224,7 +224,7 @@ class Scene(Section):
         with calibrated_size(size):
             scene = handler(data if size is None else complete_framed(data, size))
         # The scene is frozen.
-        scene.__dict__["sheet"] = frame_sheet(scene.sheet, scene.render, size, scene.region)
+        scene.__dict__["sheet"] = frame_sheet(scene.sheet, scene.render, scene.image, size, scene.region)
         return scene
 
     @model_validator(mode="after")

@@ -199,8 +199,8 @@ class Sheet(Section):
             changes["mask"] = self.mask.model_copy(update={"image": path(self.mask.image)})
         return self.model_copy(update=changes) if changes else self
 
-    def with_kept_grid(self) -> Sheet:
-        """Return a copy for another mesh, which keeps smoothing and even grid of a surface from a file."""
+    def with_kept_frame(self) -> Sheet:
+        """Return a copy for another mesh or other cameras, which keeps the surface of a file."""
         if self.surface is None or self.surface.frame is None:
             return self
         frame = self.surface.frame._replace(is_kept=True)

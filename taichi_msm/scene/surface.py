@@ -182,7 +182,7 @@ class Frame(NamedTuple):
     image_size: tuple[int, int]  # width and height of `image`, to which calibrations refer [px]
     region: tuple[int, int, int, int]  # x, y, width and height of the part on the sheet [px]
     points: tuple[int, int]  # rows and columns from which smoothing and grid follow
-    is_kept: bool = False  # whether other meshes keep these points
+    is_kept: bool = False  # whether the surface keeps this frame, also with other cameras or mass points
 
 
 KINDS = ("height", "tube", "dome", "depth", "points")
