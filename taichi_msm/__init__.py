@@ -42,7 +42,7 @@ if TYPE_CHECKING:
         StiffnessMap,
         Tissue,
     )
-    from taichi_msm.scene.surface import Dome, Folds, HeightField, PointGrid, RestSurface, Tube
+    from taichi_msm.scene.surface import DepthMap, Dome, Folds, HeightField, PointGrid, RestSurface, Tube
     from taichi_msm.scene.tools import Instrument, Probe
     from taichi_msm.solver.state import TipForce
     from taichi_msm.sweeps.runs import Outcome
@@ -66,7 +66,7 @@ _NAMES = {
     "scene.render": "Light Render",
     "scene.scene": "Scene Time",
     "scene.sheet": "Foundation RelaxationBranch Sheet SheetMask Springs Stiffening StiffnessMap Tissue",
-    "scene.surface": "Dome Folds HeightField PointGrid RestSurface Tube",
+    "scene.surface": "DepthMap Dome Folds HeightField PointGrid RestSurface Tube",
     "scene.tools": "Instrument Probe",
     "solver.state": "TipForce",
     "sweeps.runs": "Outcome",
@@ -87,7 +87,7 @@ __all__ += [
     "Time",
     "Tissue",
 ]
-__all__ += ["Dome", "Folds", "HeightField", "PointGrid", "RestSurface", "Tube"]
+__all__ += ["DepthMap", "Dome", "Folds", "HeightField", "PointGrid", "RestSurface", "Tube"]
 __all__ += ["Flow", "Labels", "Outcome", "Playback", "Sight", "Simulation", "Surface", "TipForce"]
 __all__ += ["FitResult", "FittedMap", "Gradient"]
 __all__ += ["export", "fit", "gradient", "load_scene", "resume", "run", "sweep"]

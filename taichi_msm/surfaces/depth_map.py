@@ -15,7 +15,7 @@ from taichi_msm.arithmetic import Array
 class DepthMap:
     """Depths along the viewing direction [m], shape (h, w), and the pixels that have one."""
 
-    depth: Array  # 1 where there is none
+    depth: Array  # any above 0 where there is none
     is_known: NDArray[np.bool_]
 
     @classmethod
@@ -28,7 +28,7 @@ class DepthMap:
         z = numbers[..., 2] if numbers.ndim == 3 else numbers
         is_known = z > 0
         is_known &= z != np.iinfo(z.dtype).max if z.dtype.kind in "iu" else np.isfinite(z)
-        return cls(np.where(is_known, z, 1 / unit) * unit, is_known)
+        return cls(np.where(is_known, z.astype(np.float64), 1.0) * unit, is_known)
 
     def from_distances(self, x: Array, y: Array) -> DepthMap:
         """Convert distances from the eye, for undistorted normalised coordinates of the pixels, shape (h, w)."""

@@ -19,37 +19,55 @@ TRUNCATION = 8.0
 # Least sum of the weights ok G; with less, G becomes twice as wide.
 MIN_WEIGHT = 1e-3
 
-# Least determinant of the covariance of the coordinates [px^4], in squares of G's standard deviation [px^2]: pixels in a
-# line have 0, a row and the next one 1/4.
+# Least determinant of the covariance of x and y [px^4], over the variance of G [px^2]: pixels in a line have 0, two
+# neighbouring rows 1/4.
 MIN_DETERMINANT = 1e-6
 
 # Rows of a block of a filter.
-BLOCK_ROWS = 64
+BLOCK_ROWS = 128
 
 
 def smooth_inverse_depth(inverse: Array, is_known: NDArray[np.bool_], x: Array, y: Array, deviation: float) -> Array:
     """Return e_s for e = `inverse`, shape (h, w), at undistorted coordinates x, y of the pixels, in any unit.
 
-    G has the standard deviation `deviation` [px]; with 0, only pixels without depth change, with 1 px. NaN without any
-    depth.
+    G has the standard deviation `deviation` [px]; with 0, only pixels without depth change, by one of 1 px. At least one
+    pixel must be known.
     """
-    smooth = np.where(is_known, inverse, np.nan)
-    is_open = ~is_known if deviation == 0 else np.ones_like(is_known)
+    is_kept = is_known & (deviation == 0)
+    is_open = ~is_kept
     known, x, y = is_known.astype(float), _in_pixels(x, axis=1), _in_pixels(y, axis=0)
-    values = np.where(is_known, inverse, 0.0)
+    # Fits keep planes, so one through all pixels is left out, for less rounding.
+    whole = _plane(inverse, is_known, x, y)
+    values = np.where(is_known, inverse - whole, 0.0)
+    smooth = values.copy()
+    moments = known, known * x, known * y, known * x * x, known * x * y, known * y * y
+    moments += values, values * x, values * y
     deviation = deviation or 1.0
     while is_open.any():
-        at = np.flatnonzero(is_open.any(axis=1)), np.flatnonzero(is_open.any(axis=0))
-        fit, weight, determinant = _fit_planes(values, known, x, y, deviation, at)
-        # No weight suffices far from few pixels, and no width where all of them are in a line.
+        # Far from few pixels no width has the weight, and where all pixels are in a line none has a plane.
         is_last = deviation > sum(is_open.shape)
-        is_done = (weight >= MIN_WEIGHT) & (determinant > MIN_DETERMINANT * deviation**2) | is_last
-        is_done &= is_open[np.ix_(*at)]
-        rows, cols = at[0][:, None], at[1]
-        smooth[rows, cols] = np.where(is_done, fit, smooth[rows, cols])
-        is_open[rows, cols] &= ~is_done
+        gaussian = _Gaussian(deviation, is_known, is_open)
+        is_near = np.full_like(is_open, is_last)
+        is_near[gaussian.at] |= gaussian.filter(known) >= MIN_WEIGHT
+        is_near &= is_open
+        if is_near.any():
+            gaussian = _Gaussian(deviation, is_known, is_near)
+            at = gaussian.at
+            fit, is_plane = _fit_planes([gaussian.filter(each) for each in moments], x[at], y[at], deviation)
+            is_done = is_near[at] & (is_plane | is_last)
+            smooth[at] = np.where(is_done, fit, smooth[at])
+            is_open[at] &= ~is_done
         deviation *= 2
-    return smooth
+    return np.where(is_kept, inverse, whole + smooth)
+
+
+def _plane(values: Array, is_known: NDArray[np.bool_], x: Array, y: Array) -> Array:
+    """Return the plane that fits values of known pixels best; across a line of pixels it is level."""
+    places = np.stack([x, y])
+    offsets = places - places[:, is_known].mean(axis=1)[:, None, None]
+    mean, known = values[is_known].mean(), offsets[:, is_known]
+    slopes = np.linalg.lstsq(known @ known.T, known @ (values[is_known] - mean), rcond=1e-9)[0]
+    return np.asarray(mean + slopes[0] * offsets[0] + slopes[1] * offsets[1])
 
 
 def _in_pixels(coordinate: Array, axis: int) -> Array:
@@ -57,47 +75,43 @@ def _in_pixels(coordinate: Array, axis: int) -> Array:
     return (coordinate - (coordinate.max() + coordinate.min()) / 2) * (coordinate.shape[axis] / np.ptp(coordinate))
 
 
-def _fit_planes(
-    values: Array, known: Array, x: Array, y: Array, deviation: float, at: tuple[NDArray[np.int_], NDArray[np.int_]]
-) -> tuple[Array, Array, Array]:
-    """Return value, weight and determinant of the covariance of the fits at rows and columns, shape (m, n) each."""
-    down, across = (_Gaussian(deviation, index, size) for index, size in zip(at, known.shape, strict=True))
-
-    def filtered(values: Array) -> Array:
-        return across.filter(down.filter(values).T).T
-
-    def mean(values: Array) -> Array:
-        return filtered(known * values) / np.maximum(weight, np.finfo(float).tiny)
-
-    weight = filtered(known)
-    mean_x, mean_y, mean_value = mean(x), mean(y), mean(values)
-    xx, xy, yy = mean(x * x) - mean_x**2, mean(x * y) - mean_x * mean_y, mean(y * y) - mean_y**2
+def _fit_planes(moments: list[Array], x: Array, y: Array, deviation: float) -> tuple[Array, NDArray[np.bool_]]:
+    """Return the value at x, y [px] of the plane with the filtered moments, and whether they have one; else the mean."""
+    weight = np.maximum(moments[0], np.finfo(float).tiny)
+    mean_x, mean_y, xx, xy, yy, mean, x_value, y_value = (each / weight for each in moments[1:])
+    # Covariances, and the plane through the means.
+    xx, xy, yy = xx - mean_x * mean_x, xy - mean_x * mean_y, yy - mean_y * mean_y
+    x_value, y_value = x_value - mean_x * mean, y_value - mean_y * mean
     determinant = xx * yy - xy * xy
-    x_value, y_value = mean(x * values) - mean_x * mean_value, mean(y * values) - mean_y * mean_value
-    d_x, d_y = x[np.ix_(*at)] - mean_x, y[np.ix_(*at)] - mean_y
-    slope = (x_value * yy - y_value * xy) * d_x + (y_value * xx - x_value * xy) * d_y
     is_plane = determinant > MIN_DETERMINANT * deviation**2
-    fit = mean_value + np.divide(slope, determinant, out=np.zeros_like(slope), where=is_plane)
-    return np.where(weight > 0, fit, np.nan), weight, determinant
+    rise = (x_value * yy - y_value * xy) * (x - mean_x) + (y_value * xx - x_value * xy) * (y - mean_y)
+    return mean + np.divide(rise, determinant, out=np.zeros_like(rise), where=is_plane), is_plane
 
 
 class _Gaussian:
-    """Gaussian filter along axis 0, with zeros outside, at some rows.
+    """Gaussian filter with zeros outside, of pixels `is_source` at those `is_target`, shape (h, w) each.
 
     In blocks of rows, products of matrices take less time than sums of shifted rows, most of all for wide filters.
     """
 
-    def __init__(self, deviation: float, rows: NDArray[np.int_], size: int) -> None:
+    def __init__(self, deviation: float, is_source: NDArray[np.bool_], is_target: NDArray[np.bool_]) -> None:
+        self.at = np.ix_(is_target.any(axis=1), is_target.any(axis=0))
         radius = int(TRUNCATION * deviation + 0.5)
         weights = np.exp(-0.5 * (np.arange(radius + 1) / deviation) ** 2)
         weights /= 2 * weights.sum() - 1
         self._blocks = []
-        for start in range(0, len(rows), BLOCK_ROWS):
-            block = rows[start : start + BLOCK_ROWS]
-            near = np.arange(max(block[0] - radius, 0), min(block[-1] + radius + 1, size))
-            distance = np.abs(block[:, None] - near)
-            matrix = np.where(distance <= radius, weights[np.minimum(distance, radius)], 0.0)
-            self._blocks.append((matrix, slice(near[0], near[-1] + 1)))
+        for other in (1, 0):
+            first, last = np.flatnonzero(is_source.any(axis=other))[[0, -1]]
+            rows, blocks = np.flatnonzero(is_target.any(axis=other)), []
+            for block in np.split(rows, range(BLOCK_ROWS, len(rows), BLOCK_ROWS)):
+                low = max(block[0] - radius, first)
+                near = slice(low, max(low, min(block[-1] + radius, last) + 1))
+                distance = np.abs(block[:, None] - np.arange(near.start, near.stop))
+                blocks.append((np.where(distance <= radius, weights[np.minimum(distance, radius)], 0.0), near))
+            self._blocks.append(blocks)
 
     def filter(self, values: Array) -> Array:
-        return np.concatenate([matrix @ values[near] for matrix, near in self._blocks])
+        """Filter along columns, then along rows; the result has the rows and columns `at`."""
+        for blocks in self._blocks:
+            values = np.concatenate([matrix @ values[near] for matrix, near in blocks]).T
+        return values
