@@ -15,7 +15,7 @@ LAYERS = [
     {"arithmetic", "errors", "plot_style", "version"},
     {"dual", "system"},
     {"images", "integrators", "laws", "lenses", "shapes"},
-    {"array_files"},
+    {"array_files", "surfaces"},
     {"camera_files"},
     {"scene"},
     {"cameras"},
