@@ -74,6 +74,19 @@ class Mask:
             covered |= inside & self.cells[i.clip(0, rows - 1), j.clip(0, cols - 1)]
         return covered
 
+    def first_gap(self, start: Array, end: Array) -> float | None:
+        """Return the fraction of a line between two places, as for `covers`, at which it leaves the sheet, or None."""
+        (rows, cols), offset = self.cells.shape, end - start
+        crossings = [np.array([0.0, 1.0])]
+        for axis, count in enumerate((cols, rows)):
+            if offset[axis]:
+                crossings.append((np.arange(count + 1) / count - start[axis]) / offset[axis])
+        # Between two crossings the line is in one cell.
+        cuts = np.unique(np.concatenate(crossings).clip(0, 1))
+        middles = np.concatenate([[0.0], (cuts[1:] + cuts[:-1]) / 2, [1.0]])
+        gaps = np.flatnonzero(~self.covers(start + middles[:, None] * offset))
+        return float(middles[gaps[0]]) if gaps.size else None
+
     def pinched_points(self) -> Iterator[tuple[int, int]]:
         """Yield row and column of the mass points at which two parts meet."""
         parts = self.parts
