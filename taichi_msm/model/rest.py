@@ -52,6 +52,15 @@ class Rest(ABC):
         """Lower and upper corner of the sheet's box [m], shape (2, 3)."""
         return np.stack([self.present_positions.min(axis=0), self.present_positions.max(axis=0)])
 
+    @cached_property
+    def unmasked_box(self) -> Array:
+        """Lower and upper corner of the box of all mass points, with and without sheet [m], shape (2, 3)."""
+        return (
+            self.box
+            if self.mask is None
+            else np.stack([self.position.min(axis=(0, 1)), self.position.max(axis=(0, 1))])
+        )
+
     @property
     def sides(self) -> tuple[float, float]:
         """Height and width of the sheet, on a curved one means of its lengths along columns and rows [m]."""

@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from taichi_msm.arithmetic import Array
+from taichi_msm.model.mask import Mask
 from taichi_msm.model.rest import rest_of
 from taichi_msm.model.tool_force import control_point
 from taichi_msm.model.tools import build_tools, solid_tools, unit_vector
@@ -86,7 +87,7 @@ def _cell_coordinates(coordinates: Array, points: tuple[int, int], refine: int) 
 
 
 class Surface(NamedTuple):
-    """Textured triangles, with vertices row by row from the top left."""
+    """Textured triangles, with vertices row by row from the top left; a mask leaves those of its cells."""
 
     vertices: NDArray[np.floating]  # positions [m], shape (vertices, 3)
     triangles: NDArray[np.int32]  # indices of vertices, shape (triangles, 3), counter-clockwise from above
@@ -103,23 +104,28 @@ class Solid(NamedTuple):
     shape: Shape
 
 
-def refine_surface(position: NDArray[np.floating], refine: int) -> Surface:
+def refine_surface(position: NDArray[np.floating], refine: int, mask: Mask | None = None) -> Surface:
     """Return the triangles of the sheet after bilinear refinement (section 2 of the paper).
 
-    Every small quad is divided by the diagonal from top left to bottom right.
+    Every small quad is divided by the diagonal from top left to bottom right. `mask` has the cells that are sheet, by
+    default all.
     """
     vertices = _insert(_insert(position, refine, 0), refine, 1)
     rows, cols = vertices.shape[:2]
-    corner = np.arange(rows * cols, dtype=np.int32).reshape(rows, cols)
+    quads, points = np.ones((rows - 1, cols - 1), bool), np.ones((rows, cols), bool)
+    if mask is not None:
+        quads = mask.cells.repeat(refine + 1, axis=0).repeat(refine + 1, axis=1)
+        points = Mask(quads).points
+    corner = np.cumsum(points, dtype=np.int32).reshape(rows, cols) - 1
     upper_left, upper_right = corner[:-1, :-1], corner[:-1, 1:]
     lower_left, lower_right = corner[1:, :-1], corner[1:, 1:]
     lower = np.stack([upper_left, lower_left, lower_right], axis=-1)
     upper = np.stack([upper_left, lower_right, upper_right], axis=-1)
     across, down = np.meshgrid(np.linspace(0, 1, cols), np.linspace(0, 1, rows))
     return Surface(
-        vertices.reshape(-1, 3),
-        np.stack([lower, upper], axis=2).reshape(-1, 3),
-        np.stack([across, down], axis=-1).reshape(-1, 2),
+        vertices[points],
+        np.stack([lower, upper], axis=2)[quads].reshape(-1, 3),
+        np.stack([across, down], axis=-1)[points],
     )
 
 

@@ -111,8 +111,8 @@ def sum_probe_forces(probe: Probe, sheet: Sheet, refinement: int = 1) -> tuple[f
         fine = rest_of(sheet.model_copy(update={"points": points}))
         assert isinstance(fine, CurvedRest)
         decay, areas = law.decay(fine.distances(at)), fine.areas / rest.cell_area
-        forces = decay * areas if law.by_area else decay / refinement**2
-        return force * float(forces.sum()), force * float((forces / fine.areas).max())
+        forces, is_sheet = decay * areas if law.by_area else decay / refinement**2, areas > 0
+        return force * float(forces.sum()), force * float((forces[is_sheet] / fine.areas[is_sheet]).max())
     at_x, at_y = at
     (rows, cols), (height, width) = ((count - 1) * refinement for count in sheet.points), sheet.size
     x, y = (np.arange(cols + 1) / cols - 0.5) * width, (0.5 - np.arange(rows + 1) / rows) * height
