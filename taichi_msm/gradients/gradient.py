@@ -29,10 +29,12 @@ _NUMBERS = "fit numbers instead of a map, or take finite differences"
 
 
 def require_differentiable(plan: Plan) -> None:
-    """Raise a SceneError if a scene has a curved sheet, a position-controlled tool or a term without a gradient."""
+    """Raise a SceneError if a sheet is curved or has a mask, or for a tool with a path or a term without a gradient."""
     if plan.scene.sheet.surface:
         reason = "a sheet that is curved at rest has no gradient"
         raise SceneError([f"sheet.surface: {reason}; {_NUMBERS}"])
+    if plan.scene.sheet.mask:
+        raise SceneError([f"sheet.mask: a sheet with a mask has no gradient; {_NUMBERS}"])
     for tool in plan.tools:
         reason = "a tool with a path has no gradient, as its contact begins and ends"
         raise SceneError([f"probes.{tool.probe}.path: {reason}; {_NUMBERS}"])

@@ -126,7 +126,7 @@ def read_manifest(directory: Path) -> tuple[Manifest, Plan]:
         raise _damaged(path) from None
     plan, problems = try_plan(manifest.scene)
     if unreadable := [
-        str(problem) for problem in problems if problem.path[-1:] == ("image",) or "surface" in problem.path
+        str(problem) for problem in problems if problem.path[-1:] == ("image",) or {"surface", "mask"} & {*problem.path}
     ]:
         raise SceneError(unreadable)
     numbers = () if manifest.estimate is None else asdict(manifest.estimate).values()
