@@ -69,12 +69,12 @@ class Mask:
         corners = points[:-1, :-1] | points[:-1, 1:] | points[1:, :-1] | points[1:, 1:]
         return set(np.unique(self.parts[corners & self.cells]).tolist())
 
-    def covers(self, places: Array) -> NDArray[np.bool_]:
+    def covers(self, places: Array, tolerance: float = EDGE_TOLERANCE) -> NDArray[np.bool_]:
         """Return whether places are on the sheet or its outline, from fractions across and down of shape (n, 2)."""
         rows, cols = self.cells.shape
         at, covered = np.asarray(places, float) * (cols, rows), np.zeros(len(places), bool)
         # A place on an edge belongs to the cells on both sides.
-        for shift in product((-EDGE_TOLERANCE, EDGE_TOLERANCE), repeat=2):
+        for shift in product((-tolerance, tolerance), repeat=2):
             j, i = np.floor(at + shift).astype(int).T
             inside = (i >= 0) & (i < rows) & (j >= 0) & (j < cols)
             covered |= inside & self.cells[i.clip(0, rows - 1), j.clip(0, cols - 1)]

@@ -16,6 +16,8 @@ from pydantic import TypeAdapter
 
 from taichi_msm.errors import FilesError, SceneError, require_path
 from taichi_msm.images import PictureError, file_sha256, read_rgb
+from taichi_msm.model.mask import Mask
+from taichi_msm.model.rest import rest_of
 from taichi_msm.model.sheet import rest_positions
 from taichi_msm.render.camera import camera_problems
 from taichi_msm.runs.arrays import map_array
@@ -92,8 +94,24 @@ class FinishedRun:
 
     def require_same_pictures(self, *, drawn: bool) -> None:
         """Raise a FilesError unless the maps, and if `drawn` the picture, have the SHA-256 of the run."""
-        pictures = {key: path for key, path in self.scene.pictures.items() if drawn or key != "image"}
-        _require_same_files(self.directory, pictures, self.sha256)
+        self._require_same({key: path for key, path in self.scene.pictures.items() if drawn or key != "image"})
+
+    def _require_same(self, files: Mapping[str, str]) -> None:
+        for key, path in files.items():
+            fault = f"{path} differs from the file of the run (SHA-256)"
+            try:
+                if file_sha256(path) == self.sha256.get(key):
+                    continue
+            except PictureError as error:
+                fault = error.fault
+            raise FilesError(f"{self.directory}: {key}: {fault}; {RESTORE_PICTURE}")
+
+    def mask(self) -> Mask | None:
+        """Return the cells that are sheet, None for all; a FilesError unless the file has the SHA-256 of the run."""
+        if self.scene.sheet.mask is None:
+            return None
+        self._require_same(self.scene.sheet.files)
+        return rest_of(self.scene.sheet).mask
 
     def has_output(self, key: str) -> bool:
         """Return whether the results contain the files of an entry of `output`."""
@@ -152,16 +170,21 @@ def read_run(directory: str | Path) -> FinishedRun:
             raise FilesError(f"{path}: {entry_kind(path)}, which no run writes; name the folder that `run --out` wrote")
         data = read_regular(path, MAX_RECORD_BYTES)
         record = json.loads(data)
-        frames = record["frames"]
+        scene, frames = _read_scene(record), record["frames"]
         sha256, overrides = _DIGESTS.validate_python(record["sha256"]), _OVERRIDES.validate_python(record["overrides"])
-        scene = _read_scene(path.parent, record, sha256)
         is_resolved = scene.time.precision != "auto" and scene.sheet.tolerance is scene.time.tolerance is None
         if not isinstance(frames, int) or not 1 <= frames <= scene.time.frames + 1 or not is_resolved:
             raise damaged_result(path)
         largest_frame = min(record.get("max_displacement_frame", frames), frames - 1)
-    return FinishedRun(
-        path.parent, record["status"], scene, frames, largest_frame, sha256, overrides, data, scene.render.main
-    )
+        run = FinishedRun(
+            path.parent, record["status"], scene, frames, largest_frame, sha256, overrides, data, scene.render.main
+        )
+        run._require_same(scene.sheet.files)  # without which there is no sheet
+        problems = [*try_plan(scene)[1], *camera_problems(scene)]
+        # Other problems are ignored: later methods check the pictures, and the step was valid with the original map.
+        if any(problem.path[-1:] != ("image",) and problem.path[0] != "time" for problem in problems):
+            raise SceneError([str(problem) for problem in problems])
+    return run
 
 
 @contextmanager
@@ -183,26 +206,9 @@ def damaged_result(path: Path) -> FilesError:
     return FilesError(f"{path}: damaged, or not of this run; run the scene again")
 
 
-def _require_same_files(directory: Path, files: Mapping[str, str], sha256: Mapping[str, str]) -> None:
-    """Raise a FilesError unless files, by key of the scene, have the SHA-256 of the run in a directory."""
-    for key, path in files.items():
-        fault = f"{path} differs from the file of the run (SHA-256)"
-        try:
-            if file_sha256(path) == sha256.get(key):
-                continue
-        except PictureError as error:
-            fault = error.fault
-        raise FilesError(f"{directory}: {key}: {fault}; {RESTORE_PICTURE}")
-
-
-def _read_scene(directory: Path, record: Mapping[str, Any], sha256: Mapping[str, str]) -> Scene:
+def _read_scene(record: Mapping[str, Any]) -> Scene:
     """Build the scene of a record, with picture paths relative to the current directory."""
     scene, folder = Scene(**record["scene"]), Path(record["working_directory"])
     if folder != Path.cwd():
         scene = scene.with_pictures(lambda path: str(folder / path))
-    _require_same_files(directory, scene.sheet.files, sha256)  # without which there is no sheet
-    problems = [*try_plan(scene)[1], *camera_problems(scene)]
-    # Other problems are ignored: later methods check the pictures, and the step was valid with the original map.
-    if any(problem.path[-1:] not in (("image",), ("file",)) and problem.path[0] != "time" for problem in problems):
-        raise SceneError([str(problem) for problem in problems])
     return scene

@@ -82,14 +82,13 @@ def spring_families(plan: Plan) -> Iterator[SpringFamily]:
 def energy_density(plan: Plan, displacement: Array) -> Array:
     """Return the energy density of the springs [J/m2], shape (rows, cols), without bending and foundation.
 
-    Each end of a spring has half of its energy, and a point without sheet none. The sum of density times `area_shares`
-    times the area of a cell is therefore the energy of all springs, relative to the state at rest. The displacement
-    x - X [m] has the shape (rows, cols, 3).
+    Each end of a spring has half of its energy. The sum of density times `area_shares` times the area of a cell is
+    therefore the energy of all springs, relative to the state at rest. The displacement x - X [m] has the shape (rows,
+    cols, 3). Points without sheet have the density 0.
     """
-    by_point, cell_area = np.zeros(displacement.shape[:2]), rest_of(plan.scene.sheet).cell_area
+    by_point, areas = np.zeros(displacement.shape[:2]), rest_of(plan.scene.sheet).cell_area * plan.area_shares
     for family in spring_families(plan):
         energy = family.energy(displacement)
         by_point[family.start] += energy / 2
         by_point[family.end] += energy / 2
-    areas = cell_area * plan.area_shares
-    return np.divide(by_point, areas, out=np.zeros(areas.shape), where=areas > 0)
+    return by_point / np.where(areas > 0, areas, 1.0)
