@@ -130,7 +130,7 @@ def gradient(scene: Scene | Mapping[str, Any], loss: Loss, threads: int | None =
         The value of the loss and its derivatives.
 
     Raises:
-        SceneError: when the scene cannot be run, or a tool has a path.
+        SceneError: when the scene cannot be run, a tool has a path, or the sheet has a surface or a mask.
         ArgumentError: when the loss does not return a number and such an array.
         DivergedError: when the simulation diverges.
         MsmError: when the stiffness of a quasi-static sheet is singular.

@@ -34,11 +34,16 @@ def mask_problems(scene: Scene) -> Iterator[Problem]:
         text = f"two parts meet only in the point at row {row}, column {column}; join them by a cell, or part them"
         yield Problem(KEY, text)
     else:
-        for index, probe in enumerate(scene.probes):
-            if not probe.moved and (place := _place_without_sheet(probe, mask, scene.time.duration)):
-                moves = isinstance(probe.at[0], tuple)
-                remedy = "two keyframes at one time jump over a hole" if moves else "move the tool onto the sheet"
-                yield Problem(("probes", index, "at"), f"{place} is on no sheet, see sheet.mask; {remedy}")
+        yield from place_problems(scene, mask)
+
+
+def place_problems(scene: Scene, mask: Mask) -> Iterator[Problem]:
+    """Yield a problem for each force-controlled tool that is on no sheet at any time."""
+    for index, probe in enumerate(scene.probes):
+        if not probe.moved and (place := _place_without_sheet(probe, mask, scene.time.duration)):
+            moves = isinstance(probe.at[0], tuple)
+            remedy = "two keyframes at one time jump over a hole" if moves else "move the tool onto the sheet"
+            yield Problem(("probes", index, "at"), f"{place} is on no sheet, see sheet.mask; {remedy}")
 
 
 def _place_without_sheet(probe: Probe, mask: Mask, duration: float) -> str:

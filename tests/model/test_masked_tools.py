@@ -222,6 +222,14 @@ def test_a_force_that_stays_on_the_sheet(at: Any) -> None:
     assert plan_of(probes=[push(at)]).slots
 
 
+def test_steering(message: Messages) -> None:
+    simulation = Simulation(plan_of(probes=[push([0.2, 0.5])]).scene)
+    simulation.advance()
+    with message.raises(SceneError, "probes.0.at:"):
+        simulation.steer([push([0.5, 0.5])])
+    simulation.steer([push([0.8, 0.5])])
+
+
 def test_clamps(message: Messages) -> None:
     """A clamp holds the points of its side with sheet; a side without is refused."""
     mask = np.full((20, 30), 255)
