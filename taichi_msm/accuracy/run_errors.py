@@ -15,6 +15,7 @@ from taichi_msm.accuracy.buckling import buckling_warnings
 from taichi_msm.accuracy.companions import NEGLIGIBLE_ERROR, QUASISTATIC_REASON, CompanionRuns
 from taichi_msm.accuracy.contact_warnings import tool_contact_warnings
 from taichi_msm.accuracy.divergence import energy_growth_warnings
+from taichi_msm.accuracy.mask import mask_notes
 from taichi_msm.accuracy.mesh import (
     LARGE_STEP_ERROR,
     MAX_DIFFERENCE,
@@ -235,6 +236,7 @@ def run_warnings(
         else:
             yield f"force error at most about {_percent(force.error, 2)} % of the greatest force"
     yield from surface_notes(scene)
+    yield from mask_notes(plan)
     yield from tool_force.force_warnings(scene, probes)
     tool_warnings = list(path_warnings(scene, plan.tools))
     yield from tool_warnings

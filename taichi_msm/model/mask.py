@@ -6,6 +6,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import product
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -63,6 +64,11 @@ class Mask:
         """Return whether each mass point belongs to a part."""
         return sum_around_points(self.parts == part) > 0
 
+    def parts_with(self, points: NDArray[np.bool_]) -> set[int]:
+        """Return the parts with any of the mass points, a mask of shape (rows, cols)."""
+        corners = points[:-1, :-1] | points[:-1, 1:] | points[1:, :-1] | points[1:, 1:]
+        return set(np.unique(self.parts[corners & self.cells]).tolist())
+
     def covers(self, places: Array, tolerance: float = EDGE_TOLERANCE) -> NDArray[np.bool_]:
         """Return whether places are on the sheet or its outline, from fractions across and down of shape (n, 2)."""
         rows, cols = self.cells.shape
@@ -73,6 +79,14 @@ class Mask:
             inside = (i >= 0) & (i < rows) & (j >= 0) & (j < cols)
             covered |= inside & self.cells[i.clip(0, rows - 1), j.clip(0, cols - 1)]
         return covered
+
+    def nearest_cells(self, i: NDArray[Any], j: NDArray[Any], places: Array) -> tuple[NDArray[Any], NDArray[Any]]:
+        """Return rows and columns of the cells (i, j) of places, or of the nearest cells where there is no sheet."""
+        from scipy.ndimage import distance_transform_edt
+
+        covered = self.covers(places)
+        rows, cols = distance_transform_edt(~self.cells, return_distances=False, return_indices=True)
+        return np.where(covered, i, rows[i, j]), np.where(covered, j, cols[i, j])
 
     def first_gap(self, start: Array, end: Array) -> float | None:
         """Return the fraction of a line between two places, as for `covers`, at which it leaves the sheet, or None."""

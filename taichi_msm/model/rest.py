@@ -102,7 +102,10 @@ class Rest(ABC):
     def refined(self, refine: int) -> Array:
         """Return points of the sheet [m], shape (n, 3), with `refine` between neighbouring mass points."""
         across, down = (np.linspace(0, 1, (count - 1) * (refine + 1) + 1) for count in self.position.shape[1::-1])
-        return self.place(self.coordinates(np.stack(np.meshgrid(across, down), axis=-1).reshape(-1, 2)))
+        places = np.stack(np.meshgrid(across, down), axis=-1)
+        if self.mask is not None:
+            places = places[Mask(np.kron(self.mask.cells, np.ones((refine + 1, refine + 1), bool))).points]
+        return self.place(self.coordinates(places.reshape(-1, 2)))
 
     @abstractmethod
     def normals(self, coordinates: Array) -> Array:

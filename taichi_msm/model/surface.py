@@ -53,10 +53,10 @@ def surface_positions(position: NDArray[np.floating], refine: int, coordinates: 
 def surface_weights(coordinates: Array, sheet: Sheet, refine: int) -> tuple[NDArray[np.intp], Array]:
     """Return the four mass points around each point of `surface_positions`, and their weights, shape (n, 4) each.
 
-    Mass points are numbered row by row.
+    Mass points are numbered row by row. A point on no sheet, as of a coarser mesh, continues the nearest cell.
     """
     cols = sheet.points[1]
-    i, j, s, t, twist = _cell_coordinates(coordinates, sheet.points, refine)
+    i, j, s, t, twist = _cell_coordinates(coordinates, sheet.points, refine, rest_of(sheet).mask)
     first = i * cols + j
     corners = np.stack([first, first + 1, first + cols, first + cols + 1], axis=1)
     return corners, np.stack([1 - s - t + twist, s - twist, t - twist, twist], axis=1)
@@ -72,7 +72,9 @@ def _interpolate(position: NDArray[np.floating], refine: int, coordinates: Array
     return a + b * s + c * t + d * twist, np.cross(b + d * t, -(c + d * s))
 
 
-def _cell_coordinates(coordinates: Array, points: tuple[int, int], refine: int) -> tuple[NDArray[Any], ...]:
+def _cell_coordinates(
+    coordinates: Array, points: tuple[int, int], refine: int, mask: Mask | None = None
+) -> tuple[NDArray[Any], ...]:
     """Return row i and column j of each point's cell, the coordinates s (across) and t (down) in it, and a twist.
 
     The twist replaces the product s t of bilinear interpolation. It is linear in each triangle of a small quad.
@@ -80,6 +82,8 @@ def _cell_coordinates(coordinates: Array, points: tuple[int, int], refine: int) 
     (rows, cols), quads = points, refine + 1
     s, t = (coordinates * (cols - 1, rows - 1)).T
     j, i = np.minimum(s.astype(int), cols - 2), np.minimum(t.astype(int), rows - 2)
+    if mask is not None:
+        i, j = mask.nearest_cells(i, j, coordinates)
     s, t = s - j, t - i
     s0, t0 = (np.minimum((each * quads).astype(int), quads - 1) / quads for each in (s, t))
     s1, t1 = s - s0, t - t0

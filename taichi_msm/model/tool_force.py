@@ -22,6 +22,7 @@ import numpy as np
 from typing_extensions import TypedDict
 
 from taichi_msm.arithmetic import Array
+from taichi_msm.model.mask import Mask
 from taichi_msm.model.rest import CurvedRest, rest_of
 from taichi_msm.scene.scene import Scene
 from taichi_msm.scene.sheet import Sheet
@@ -118,6 +119,9 @@ def sum_probe_forces(probe: Probe, sheet: Sheet, refinement: int = 1) -> tuple[f
     x, y = (np.arange(cols + 1) / cols - 0.5) * width, (0.5 - np.arange(rows + 1) / rows) * height
     along, down = np.ones(cols + 1), np.ones(rows + 1)
     along[[0, -1]], down[[0, -1]] = 0.5, 0.5
+    cells = None
+    if sheet.mask is not None:
+        cells = Mask.at_cells(sheet.mask.pixels.is_sheet, (rows + 1, cols + 1)).cell_counts
     total, largest = 0.0, 0.0
     # Blocks of rows limit the memory to about a million mass points.
     block = max(1, (1 << 20) // (cols + 1))
@@ -125,6 +129,9 @@ def sum_probe_forces(probe: Probe, sheet: Sheet, refinement: int = 1) -> tuple[f
         rows_of_block = slice(first, first + block)
         decay = law.decay(np.hypot(x - at_x, y[rows_of_block, None] - at_y))
         area_share = down[rows_of_block, None] * along
+        if cells is not None:  # a sheet of tissue
+            area_share = cells[rows_of_block] / 4
+            decay = np.where(area_share > 0, decay, 0)
         total += float((decay * area_share if law.by_area else decay).sum())
         largest = max(largest, float((decay if law.by_area else decay / area_share).max()))
     return force * total / refinement**2, force * largest / rest.cell_area

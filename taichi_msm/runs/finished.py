@@ -176,9 +176,15 @@ def read_run(directory: str | Path) -> FinishedRun:
         if not isinstance(frames, int) or not 1 <= frames <= scene.time.frames + 1 or not is_resolved:
             raise damaged_result(path)
         largest_frame = min(record.get("max_displacement_frame", frames), frames - 1)
-    return FinishedRun(
-        path.parent, record["status"], scene, frames, largest_frame, sha256, overrides, data, scene.render.main
-    )
+        run = FinishedRun(
+            path.parent, record["status"], scene, frames, largest_frame, sha256, overrides, data, scene.render.main
+        )
+        run._require_same(scene.sheet.files)  # without which there is no sheet
+        problems = [*try_plan(scene)[1], *camera_problems(scene)]
+        # Other problems are ignored: later methods check the pictures, and the step was valid with the original map.
+        if any(problem.path[-1:] != ("image",) and problem.path[0] != "time" for problem in problems):
+            raise SceneError([str(problem) for problem in problems])
+    return run
 
 
 @contextmanager
@@ -205,8 +211,4 @@ def _read_scene(record: Mapping[str, Any]) -> Scene:
     scene, folder = Scene(**record["scene"]), Path(record["working_directory"])
     if folder != Path.cwd():
         scene = scene.with_pictures(lambda path: str(folder / path))
-    problems = [*try_plan(scene)[1], *camera_problems(scene)]
-    # Other problems are ignored: later methods check the pictures, and the step was valid with the original map.
-    if any(problem.path[-1:] not in (("image",), ("file",)) and problem.path[0] != "time" for problem in problems):
-        raise SceneError([str(problem) for problem in problems])
     return scene

@@ -178,7 +178,7 @@ class Simulation(AbstractContextManager["Simulation"]):
 
         Raises:
             ArgumentError: when the compiled kernel does not support these probes.
-            SceneError: when an entry is not a valid probe, or a tool would jump.
+            SceneError: when an entry is not a valid probe, or a tool would jump, or falls on no sheet.
         """
         self._require_open()
         require_type(probes, Sequence, "probes", "a list of them")
