@@ -31,7 +31,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from functools import lru_cache, partial
+from functools import partial
 from itertools import product
 from typing import Any
 
@@ -39,6 +39,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from taichi_msm.accuracy.companions import SECOND_CELL_RATIO
+from taichi_msm.accuracy.interpolation import difference, same_outline
 from taichi_msm.accuracy.time_step import max_norm
 from taichi_msm.errors import DivergedError, Pause, ProgressCallback, SceneError
 from taichi_msm.model.plan import Plan
@@ -167,7 +168,7 @@ class MeshCompanion:
     def __init__(
         self, plan: Plan, coarse: Plan, device: Device, cores: int | None = None, step_ratio: float = 0.5
     ) -> None:
-        self._material, steps = plan.material, plan.grid.steps_per_frame
+        self._sheet, self._material, steps = plan.scene.sheet, plan.material, plan.grid.steps_per_frame
         coarsest = None if plan.has_contact else coarser_plan(coarse)
         plans = [coarse] if coarsest is None else [coarse, coarsest]
         self._solvers = []
@@ -202,7 +203,7 @@ class MeshCompanion:
         After an exception from `pause`, the companion runs cannot continue.
         """
         self._largest = max(self._largest, max_norm(displacement))
-        finer = displacement
+        finer, sheet = displacement, self._sheet
         for n, solver in enumerate(self._solvers):
             if self._differences[n] == math.inf:
                 return
@@ -213,9 +214,10 @@ class MeshCompanion:
                 return
             reading = solver.read()
             with np.errstate(all="ignore"):
-                difference = max_norm(finer - interpolate(reading.displacement, finer))
-                self._differences[n] = max(self._differences[n], difference)
-            finer = reading.displacement
+                coarse = solver.plan.scene.sheet
+                largest = max_norm(difference(finer, reading.displacement, sheet, coarse))
+                self._differences[n] = max(self._differences[n], largest)
+            finer, sheet = reading.displacement, coarse
             self._shortest_spring = min(self._shortest_spring, reading.shortest_spring)
 
     def tool_forces(self) -> NDArray[np.float64]:
@@ -344,29 +346,3 @@ def estimate_mesh_error(plan: Plan, device: Device, progress: ProgressCallback) 
             companion.compare_frame(dynamics.displacement(), pause)
         companion = first.build_second_run(in_f64, device) if companion is first else None
     return first.estimate
-
-
-def interpolate(displacement: NDArray[Any], target: NDArray[Any]) -> NDArray[np.float64]:
-    """Interpolate displacements [m], shape (rows, cols, 3), at least 4 x 4, by cubics at the nodes of another lattice.
-
-    The values of `target` do not matter, only its shape.
-    """
-    for count, target_count in zip(displacement.shape[:2], target.shape[:2], strict=True):
-        first, weights = _cubic_weights(count - 1, target_count - 1)
-        nodes = (weight[:, None, None] * displacement[first + n] for n, weight in enumerate(weights))
-        displacement = sum(nodes, start=np.zeros(())).swapaxes(0, 1)
-    return displacement
-
-
-@lru_cache(maxsize=64)
-def _cubic_weights(source: int, target: int) -> tuple[NDArray[np.intp], NDArray[np.float64]]:
-    """Return the interpolation along a side from `source` to `target` cells.
-
-    These are the index of the first of four neighbouring source nodes of every target node, shape (target + 1,), and
-    the weights of the four, shape (4, target + 1).
-    """
-    position = np.arange(target + 1) * (source / target)
-    first = np.clip(np.floor(position).astype(int) - 1, 0, source - 3)
-    t, nodes = position - first, range(4)
-    weights = [math.prod((t - zero) / (node - zero) for zero in nodes if zero != node) for node in nodes]
-    return first, np.stack(weights)
