@@ -97,7 +97,7 @@ def _masked_weights(mask: Mask, other: Mask) -> tuple[NDArray[np.bool_], csr_arr
             down, across = (_lagrange_weights(t, count) for t in (places - first)[chosen].T)
             for n, m in product(range(count), repeat=2):
                 rows.append(chosen)
-                cols.append(np.ravel_multi_index(tuple(first[chosen].T + [[n], [m]]), shape))
+                cols.append(np.ravel_multi_index((first[chosen, 0] + n, first[chosen, 1] + m), shape))
                 weights.append(down[n] * across[m])
     entries = np.concatenate(weights), (np.concatenate(rows), np.concatenate(cols))
     return compared, coo_array(entries, (len(places), math.prod(shape))).tocsr()

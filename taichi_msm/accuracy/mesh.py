@@ -14,6 +14,12 @@ to four times the time-step error, which is usually far smaller than the mesh er
 The estimate is doubled and reported as "at least" if the error may be larger: if the three runs do not converge, or if
 tissue without bending is compressed, which wrinkles more on finer meshes.
 
+With a mask the outline follows the cells, at a distance from the picture's that is of order 1 and varies from mesh to
+mesh as by chance. Hence the order counts as 1, and the larger of the two differences, each scaled to the run, as the
+difference: one of them may be small by chance. With position-controlled tools both companion runs follow, and the
+estimate is CONTACT_ERROR_FACTOR times the larger difference. On a coarser mesh a slit may close or a bridge vanish; the
+error is then "at least" the estimate (docs/decisions/0037).
+
 The force of a tool that is hardly wider than a cell differs from its total, depending on the positions of the mass
 points. The coarser runs have the same force as the run, and its difference from the total is added to the error.
 
@@ -32,7 +38,7 @@ import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
-from itertools import product
+from itertools import pairwise, product
 from typing import Any
 
 import numpy as np
@@ -42,6 +48,7 @@ from taichi_msm.accuracy.companions import SECOND_CELL_RATIO
 from taichi_msm.accuracy.interpolation import difference, same_outline
 from taichi_msm.accuracy.time_step import max_norm
 from taichi_msm.errors import DivergedError, Pause, ProgressCallback, SceneError
+from taichi_msm.model.mask import Mask
 from taichi_msm.model.plan import Plan
 from taichi_msm.model.rest import rest_of
 from taichi_msm.model.sheet import MAX_CELL_ASPECT, Maps, cell_aspect_ratio
@@ -82,6 +89,9 @@ NO_CONTACT = "a tool on a path meets no point"
 NARROW_TIP = "the radius of a tool on a path is below 0.8 of a cell, so it touches hardly any point"
 LARGE_STEP_ERROR = "the error of the time step is larger than the largest displacement"
 NOT_CONVERGED = "runs with fewer points do not approach this run"
+NO_COARSER_MESH = "there is no run with fewer points"
+OUTLINE = "with fewer points slits of the mask close or bridges vanish; take more sheet.points"
+SINGLE_RUN = "at an outline, one run with fewer points may agree by chance; --estimate-error adds a second one"
 OVERLAP = "the instruments of two tools run through each other, so the solution is not unique"
 WRINKLING = "tissue without bending wrinkles under compression, and more so with more points"
 
@@ -98,7 +108,8 @@ class MeshEstimate:
 def coarser_plan(plan: Plan, ratio: float = 0.5) -> Plan | None:
     """Plan the scene on a mesh with a ratio of the cells per side, and with the same total forces.
 
-    Return None without tissue, with too few mass points, or with cells that are not allowed.
+    Return None without tissue, with too few mass points, without a cell that is sheet, or with cells that are not
+    allowed.
     """
     scene = plan.scene
     if scene.tissue is None or min(scene.sheet.points) < MIN_POINTS_PER_SIDE:
@@ -116,15 +127,26 @@ def coarser_plan(plan: Plan, ratio: float = 0.5) -> Plan | None:
     if not valid:
         return None
 
-    def deviation(option: Scene) -> float:
-        return sum(abs(count - 1 - cell) for count, cell in zip(option.sheet.points, cells, strict=True))
+    def deviation(option: Scene) -> tuple[bool, float]:
+        few = option.sheet
+        return not _same_outline(scene.sheet, few), sum(
+            abs(n - 1 - cell) for n, cell in zip(few.points, cells, strict=True)
+        )
 
     coarse = min(valid, key=lambda option: (deviation(option), option.sheet.points))
     probes = tuple(_with_equal_force(probe, scene.sheet, coarse.sheet) for probe in scene.probes)
     return plan_variant(plan, coarse.model_copy(update={"probes": probes}))
 
 
+def _same_outline(sheet: Sheet, coarse: Sheet) -> bool:
+    mask, coarse_mask = rest_of(sheet).mask, rest_of(coarse).mask
+    return mask is None or coarse_mask is None or same_outline(mask, coarse_mask)
+
+
 def _allows_cells(scene: Scene) -> bool:
+    mask = scene.sheet.mask
+    if mask is not None and not Mask.at_cells(mask.pixels.is_sheet, scene.sheet.points).cells.any():
+        return False
     if scene.sheet.surface:
         return not any(surface_problems(scene))
     return cell_aspect_ratio(scene.sheet) <= MAX_CELL_ASPECT
@@ -178,6 +200,9 @@ class MeshCompanion:
             steps = 1 if plan.scene.time.at_rest else max(math.ceil(steps / 2), min_stable_steps(companion), min_steps)
             in_f64 = companion.with_grid(precision="f64", steps_per_frame=steps)
             self._solvers.append(build_solver(in_f64, device, cores=cores))
+        sheets = [plan.scene.sheet, *(companion.scene.sheet for companion in plans)]
+        self._masked = plan.scene.sheet.mask is not None
+        self._same_outline = all(_same_outline(*pair) for pair in pairwise(sheets))
         points = zip(plan.scene.sheet.points, coarse.scene.sheet.points, strict=True)
         # Cells of the run per cell of the first companion run, along a side.
         self._ratio = min((count - 1) / (fewer - 1) for count, fewer in points)
@@ -226,11 +251,15 @@ class MeshCompanion:
 
     def build_second_run(self, plan: Plan, device: Device, cores: int | None = None) -> MeshCompanion | None:
         """Return the second companion run, which begins at the first frame; None if the first one suffices."""
-        if self._contact and not self._unknown and self._relative_difference > SECOND_RUN_DIFFERENCE:
+        if self._contact and not self._unknown and self._needs_second_run:
             coarse = coarser_plan(plan, SECOND_CELL_RATIO)
             if coarse is not None:
                 self._second_run = MeshCompanion(plan, coarse, device, cores, SECOND_CELL_RATIO)
         return self._second_run
+
+    @property
+    def _needs_second_run(self) -> bool:
+        return self._masked or self._relative_difference > SECOND_RUN_DIFFERENCE
 
     @property
     def _relative_difference(self) -> float:
@@ -247,37 +276,46 @@ class MeshCompanion:
             return MeshEstimate(math.inf, "the run with fewer points diverged")
         if self._contact:
             return self._contact_estimate(first / self._largest)
-        order, doubt = 1.0, ""
+        order = 1.0
         if others and first > 0:
             order = math.log(others[0] / first) / math.log(self._ratio) if others[0] > 0 else -math.inf
-        if not 1 <= order <= 3:
-            doubt = "runs with fewer points do not converge"
-        elif self._may_wrinkle:
-            doubt = WRINKLING
+        converges = order >= 0 if self._masked else 1 <= order <= 3
+        doubt = self._doubt if converges else "runs with fewer points do not converge"
+        if self._masked:
+            first, order = max([first, *(other / self._ratio for other in others)]), 1.0
         # An order above 2 counts as 2 minus a quarter of the excess (docs/decisions/0022).
         assumed_order = max(1.0, min(order, 2 - (order - 2) / 4))
         relative = first / (self._ratio**assumed_order - 1) / self._largest
         return MeshEstimate((2 if doubt else 1) * relative + self._sampling_error, doubt)
 
     @property
-    def _may_wrinkle(self) -> bool:
+    def _doubt(self) -> str:
+        """Reason for a larger error than that of converging runs; empty without one."""
+        second = self._second_run
+        if not (self._same_outline and (second is None or second._same_outline)):
+            return OUTLINE
+        if self._masked and self._contact and second is None:
+            return SINGLE_RUN
         # The shortest spring is compressed by more than 1e-4 of its rest length.
         compressed = self._shortest_spring < 1 - self._material.tension - 1e-4
-        return self._material.bending == 0 and compressed
+        return WRINKLING if self._material.bending == 0 and compressed else ""
 
     def _contact_estimate(self, difference: float) -> MeshEstimate:
         """Estimate the error from the relative difference of the first companion run."""
         if self._unknown:
             return MeshEstimate(math.inf, self._unknown)
         error = CONTACT_ERROR_FACTOR * difference
-        if difference > SECOND_RUN_DIFFERENCE:
+        if self._needs_second_run:
             second = math.inf if self._second_run is None else self._second_run._relative_difference
             factor = SECOND_GRIP_ERROR_FACTOR if self._grips else SECOND_ERROR_FACTOR
-            if second <= MAX_DIFFERENCE:
-                error = factor * math.sqrt(min(difference, MAX_DIFFERENCE_RATIO * second) * second)
+            limited = min(difference, MAX_DIFFERENCE_RATIO * second)
+            if second <= MAX_DIFFERENCE and self._masked:
+                error = CONTACT_ERROR_FACTOR * max(limited, second)
+            elif second <= MAX_DIFFERENCE:
+                error = factor * math.sqrt(limited * second)
             elif self._second_run is not None or difference > UNRELIABLE_DIFFERENCE:
                 return MeshEstimate(math.inf, NOT_CONVERGED)
-        return MeshEstimate(error + self._sampling_error, WRINKLING if self._may_wrinkle else "", at_most=True)
+        return MeshEstimate(error + self._sampling_error, self._doubt, at_most=True)
 
 
 def with_points(scene: Scene, points: tuple[int, int]) -> Scene:
@@ -314,7 +352,7 @@ def choose_points(
         # The error decreases at most with the square of the cell length. A target of 0.8 of the tolerance leads to
         # nearly the coarsest mesh.
         needed = refinement * math.sqrt(estimate.error / (0.8 * tolerance))
-        if estimate.doubt in (NARROW_TIP, NOT_CONVERGED) and needed == math.inf:
+        if estimate.doubt in (NARROW_TIP, NOT_CONVERGED, NO_COARSER_MESH) and needed == math.inf:
             needed = MAX_CELL_REFINEMENT * refinement  # On a finer mesh the error is known.
         if needed > max_refinement:
             break
@@ -332,9 +370,10 @@ def choose_points(
 
 
 def estimate_mesh_error(plan: Plan, device: Device, progress: ProgressCallback) -> MeshEstimate:
-    """Return the mesh error of a scene with a `mesh_companion_plan`, by a run and its companion runs, all in f64."""
+    """Return the mesh error of a scene, by a run and its companion runs, all in f64."""
     in_f64, coarse, grid = plan.with_grid(precision="f64"), mesh_companion_plan(plan), plan.grid
-    assert coarse is not None
+    if coarse is None:
+        return MeshEstimate(math.inf, NO_COARSER_MESH)
     first = MeshCompanion(in_f64, coarse, device)
     companion: MeshCompanion | None = first
     while companion is not None:
