@@ -14,11 +14,10 @@ to four times the time-step error, which is usually far smaller than the mesh er
 The estimate is doubled and reported as "at least" if the error may be larger: if the three runs do not converge, or if
 tissue without bending is compressed, which wrinkles more on finer meshes.
 
-With a mask the outline follows the cells, at a distance from the picture's that is of order 1 and varies from mesh to
-mesh as by chance. Hence the order counts as 1, and the larger of the two differences, each scaled to the run, as the
-difference: one of them may be small by chance. With position-controlled tools both companion runs follow, and the
-estimate is CONTACT_ERROR_FACTOR times the larger difference. On a coarser mesh a slit may close or a bridge vanish; the
-error is then "at least" the estimate (docs/decisions/0037).
+With a mask the outline follows the cells. Its distance from the picture's outline is of order 1 in the cell length, and
+varies from mesh to mesh as if by chance, so one difference may be small. Hence the order counts as 1, and the larger of
+both differences counts, the second one scaled to the run with MASK_ORDER. On coarser meshes slits may close and bridges
+vanish; the error is then "at least" the estimate, doubled (docs/decisions/0037).
 
 The force of a tool that is hardly wider than a cell differs from its total, depending on the positions of the mass
 points. The coarser runs have the same force as the run, and its difference from the total is added to the error.
@@ -27,7 +26,8 @@ Position-controlled tools touch one mass point after another, and few or none on
 companion run with 1 / sqrt(2) of the cells per side and half the steps. It is compared with the run itself, because a
 coarse time-step companion may have other contacts, and the estimate is CONTACT_ERROR_FACTOR times the difference. A
 difference above SECOND_RUN_DIFFERENCE is unreliable, because the tool may have left one of the two sheets earlier. A
-second companion run with SECOND_CELL_RATIO of the cells per side then follows (docs/decisions/0027).
+second companion run with SECOND_CELL_RATIO of the cells per side then follows (docs/decisions/0027), and with a mask
+always; the estimate is then CONTACT_ERROR_FACTOR times the larger difference.
 
 With `springs`, a sheet with another mesh is a different sheet, so its error is undefined.
 """
@@ -77,6 +77,9 @@ MAX_DIFFERENCE_RATIO = 8.0  # largest meaningful difference of the first compani
 SECOND_ERROR_FACTOR, SECOND_GRIP_ERROR_FACTOR = 0.8, 1.2
 MAX_DIFFERENCE = 1.0  # largest meaningful difference from the last companion run
 MIN_RADIUS_CELLS = 0.8  # smallest meaningful radius of a tool, in cells of the run
+
+# Order of the difference between coarser runs with a mask: between 1 at the outline and 2 elsewhere.
+MASK_ORDER = 1.5
 
 # Largest refinement of the cells from one trial run of a search to the next.
 MAX_CELL_REFINEMENT = 2.0
@@ -282,11 +285,13 @@ class MeshCompanion:
         converges = order >= 0 if self._masked else 1 <= order <= 3
         doubt = self._doubt if converges else "runs with fewer points do not converge"
         if self._masked:
-            first, order = max([first, *(other / self._ratio for other in others)]), 1.0
+            first, order = max([first, *(other / self._ratio**MASK_ORDER for other in others)]), 1.0
         # An order above 2 counts as 2 minus a quarter of the excess (docs/decisions/0022).
         assumed_order = max(1.0, min(order, 2 - (order - 2) / 4))
         relative = first / (self._ratio**assumed_order - 1) / self._largest
-        return MeshEstimate((2 if doubt else 1) * relative + self._sampling_error, doubt)
+        # Order 1 already includes wrinkles.
+        certain = not doubt or (self._masked and doubt == WRINKLING)
+        return MeshEstimate((1 if certain else 2) * relative + self._sampling_error, doubt)
 
     @property
     def _doubt(self) -> str:
