@@ -33,10 +33,9 @@ TOWARDS_INSIDE = 0.01
 
 def difference(displacement: NDArray[Any], other: NDArray[Any], sheet: Sheet, other_sheet: Sheet) -> Array:
     """Subtract displacements on another mesh [m], interpolated, at mass points; 0 where both cannot be compared."""
-    mask, other_mask = rest_of(sheet).mask, rest_of(other_sheet).mask
-    if mask is None or other_mask is None:
+    if sheet.mask is None:
         return np.asarray(displacement - interpolate(other, displacement))
-    compared, weights = _masked_weights(mask, other_mask)
+    compared, weights = _masked_weights(_mask_of(sheet), _mask_of(other_sheet))
     result = np.zeros(displacement.shape)
     result[compared] = displacement[compared] - weights @ other.reshape(-1, 3)
     return result
@@ -110,11 +109,19 @@ def _shifted_points(mask: Mask) -> Array:
     return np.asarray(points + TOWARDS_INSIDE * (inside - points))
 
 
-def same_outline(mask: Mask, other: Mask) -> bool:
+def same_outline(sheet: Sheet, coarse: Sheet) -> bool:
     """Return whether a coarser mesh has the same parts and holes, and no mass point far from its sheet."""
     from scipy.ndimage import binary_dilation
 
-    scale = np.array(other.cells.shape) / mask.cells.shape
-    cells = np.floor(_shifted_points(mask)[mask.points] * scale).astype(int)
+    if sheet.mask is None:
+        return True
+    mask, other = _mask_of(sheet), _mask_of(coarse)
+    cells = np.floor(_shifted_points(mask)[mask.points] * other.cells.shape / mask.cells.shape).astype(int)
     near = binary_dilation(other.cells, np.ones((3, 3)))
     return mask.topology == other.topology and bool(near[tuple(cells.T)].all())
+
+
+def _mask_of(sheet: Sheet) -> Mask:
+    mask = rest_of(sheet).mask
+    assert mask is not None
+    return mask

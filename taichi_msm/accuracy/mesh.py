@@ -132,18 +132,13 @@ def coarser_plan(plan: Plan, ratio: float = 0.5) -> Plan | None:
 
     def deviation(option: Scene) -> tuple[bool, float]:
         few = option.sheet
-        return not _same_outline(scene.sheet, few), sum(
+        return not same_outline(scene.sheet, few), sum(
             abs(n - 1 - cell) for n, cell in zip(few.points, cells, strict=True)
         )
 
     coarse = min(valid, key=lambda option: (deviation(option), option.sheet.points))
     probes = tuple(_with_equal_force(probe, scene.sheet, coarse.sheet) for probe in scene.probes)
     return plan_variant(plan, coarse.model_copy(update={"probes": probes}))
-
-
-def _same_outline(sheet: Sheet, coarse: Sheet) -> bool:
-    mask, coarse_mask = rest_of(sheet).mask, rest_of(coarse).mask
-    return mask is None or coarse_mask is None or same_outline(mask, coarse_mask)
 
 
 def _allows_cells(scene: Scene) -> bool:
@@ -205,7 +200,7 @@ class MeshCompanion:
             self._solvers.append(build_solver(in_f64, device, cores=cores))
         sheets = [plan.scene.sheet, *(companion.scene.sheet for companion in plans)]
         self._masked = plan.scene.sheet.mask is not None
-        self._same_outline = all(_same_outline(*pair) for pair in pairwise(sheets))
+        self._same_outline = all(same_outline(*pair) for pair in pairwise(sheets))
         points = zip(plan.scene.sheet.points, coarse.scene.sheet.points, strict=True)
         # Cells of the run per cell of the first companion run, along a side.
         self._ratio = min((count - 1) / (fewer - 1) for count, fewer in points)

@@ -25,7 +25,6 @@ from taichi_msm.accuracy.mesh import (
 from taichi_msm.accuracy.run_errors import RunErrorEstimates, RunErrorEstimator, run_warnings
 from taichi_msm.accuracy.time_step import max_norm
 from taichi_msm.load.check import check_scene
-from taichi_msm.model.mask import Mask
 from taichi_msm.model.rest import rest_of
 from taichi_msm.model.tool_force import probe_records
 from taichi_msm.scene.scene import Scene
@@ -119,11 +118,12 @@ def test_points_of_both_sheets_are_compared(name: str) -> None:
 
 
 OUTLINES = {
-    "hole": (["....", ".##.", "....", "...."], ["....", "#..."], False),
+    "hole": (["####", "#..#", "####", "####"], ["##", "##"], False),
     "part": (["#...", "#...", "...#", "...#"], ["#.", ".#"], False),
     "bridge": (["#####.", "#...##", "#.####"], ["####", "#..#", "####"], False),
     "tongue": (["......", "######", "######", "......", "......", "......"], ["#..", "#..", "..."], False),
-    "same": (["####", "#..#", "####", "####"], ["###", "#.#", "###"], True),
+    "shifted": (["####", "#..#", "####", "####"], ["###", "#.#", "###"], True),
+    "oblique": (["####", "#.##", "##.#", "####"], ["###", "#.#", "###"], True),
 }
 
 
@@ -131,8 +131,13 @@ OUTLINES = {
 def test_outline_with_fewer_points(name: str) -> None:
     """Of # cells: as many holes and parts, and every mass point within a cell of the coarse sheet."""
     fine, coarse, same = OUTLINES[name]
-    masks = [Mask(np.array([[pixel == "#" for pixel in row] for row in rows])) for rows in (fine, coarse)]
-    assert same_outline(masks[0], masks[1]) == same
+    sheets = []
+    for rows in (fine, coarse):
+        Image.fromarray(np.array([[255 * (pixel == "#") for pixel in row] for row in rows], np.uint8)).save("mask.png")
+        points = len(rows) + 1, len(rows[0]) + 1
+        sheets.append(Sheet.model_validate({"points": points, "size": [0.1, 0.1], "mask": "mask.png"}))
+        assert rest_of(sheets[-1]).mask is not None
+    assert same_outline(*sheets) == same
 
 
 @pytest.mark.parametrize("surface", [None, {"tube": {"radius": 0.03}}])
@@ -191,6 +196,20 @@ def test_estimate_against_the_true_error(name: str, device: Device) -> None:
     assert 0.67 * error < estimates.mesh.error < 8 * error
     if estimates.force:
         assert 0.67 * force_error < estimates.force.error < 5 * force_error
+
+
+@pytest.mark.parametrize(
+    ("differences", "error", "doubt"),
+    [([0.1, 0.2], 0.1, False), ([0.1, 0.6], 0.6 / 2**1.5, False), ([0.1, 0.09], 2 * 0.1, True)],
+)
+def test_estimate_by_the_differences(differences: list[float], error: float, doubt: bool, device: Device) -> None:
+    """Order 1, and 1.5 between the coarser runs; twice as much where these differ less."""
+    plan = plan_of(pressed(masked(HOLE, fixed="outline"), force(0.3, 0.5, -0.1), REST, pretension=20))
+    coarse: Any = coarser_plan(plan)
+    companion = MeshCompanion(plan, coarse, device)
+    companion._largest, companion._differences, companion._sampling_error = 1.0, differences, 0.0
+    assert companion.estimate.error == pytest.approx(error)
+    assert bool(companion.estimate.doubt) == doubt
 
 
 def test_doubts_of_an_outline(device: Device, message: Messages) -> None:
