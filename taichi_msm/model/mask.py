@@ -60,6 +60,14 @@ class Mask:
 
         return np.asarray(label(self.cells)[0])
 
+    @cached_property
+    def topology(self) -> tuple[int, int, bool]:
+        """Number of parts and of holes, and whether two parts meet in a point."""
+        from scipy.ndimage import label
+
+        outside = np.pad(~self.cells, 1, constant_values=True)
+        return int(self.parts.max()), label(outside, np.ones((3, 3)))[1] - 1, any(self.pinched_points())
+
     def points_of(self, part: int) -> NDArray[np.bool_]:
         """Return whether each mass point belongs to a part."""
         return sum_around_points(self.parts == part) > 0
