@@ -20,7 +20,7 @@ def present_cells(sheet: Any) -> Bools:
     grey = np.array(Image.open(mask.image))
     white = grey >= (128 if grey.dtype == np.uint8 else 32768)
     height, width = white.shape
-    row, column = ((2 * np.arange(count) + 1) * pixels // (2 * count) for count, pixels in ((rows, height), (cols, width)))
+    row, column = (np.arange(rows) * 2 + 1) * height // (2 * rows), (np.arange(cols) * 2 + 1) * width // (2 * cols)
     return np.asarray(white[np.ix_(row, column)] != mask.invert)
 
 
