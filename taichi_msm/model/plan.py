@@ -107,9 +107,9 @@ class Plan:
     @property
     def mobility(self) -> Array:
         """Inverse mass of each mass point in units of a cell's, 0 if it is fixed, shape (rows, cols)."""
-        if not (self.areas_vary and self.material.by_area):
-            return ~self.fixed / 1.0
-        return ~self.fixed / np.where(self.fixed, 1.0, self.area_shares)
+        shares = self.area_shares if self.areas_vary and self.material.by_area else 1.0
+        # A point without sheet has no area.
+        return ~self.fixed / np.where(self.fixed, 1.0, shares)
 
     @property
     def areas_vary(self) -> bool:
