@@ -9,9 +9,8 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
-from taichi_msm.images import PictureError, actual_path
+from taichi_msm.images import PictureError, actual_path, require_memory
 from taichi_msm.system.files import read_regular
-from taichi_msm.system.process import available_memory
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -87,20 +86,12 @@ def quantum(values: NDArray[Any]) -> float:
     return float(np.gcd.reduce(np.diff(np.unique(values).astype(np.int64)))) if values.dtype.kind in "iu" else 0.0
 
 
-def _require_memory(path: str, size: int) -> None:
-    """Raise a PictureError if an array of a size [bytes] needs more memory than is free."""
-    needed, free = MEMORY_FACTOR * size, available_memory()
-    if needed > free:
-        fault = f"{path} needs {needed / 2**20:.3g} MiB of memory, and {free / 2**20:.3g} MiB is free"
-        raise PictureError(fault, "save fewer points")
-
-
 def _load(path: str, data: bytes, names: Sequence[str]) -> NDArray[Any]:
     """Return the array of a file's content."""
     import numpy as np
 
     if data[:2] != b"PK":
-        _require_memory(path, len(data))
+        require_memory(path, MEMORY_FACTOR * len(data), "save fewer points")
         return np.load(io.BytesIO(data), allow_pickle=False)
     with zipfile.ZipFile(io.BytesIO(data)) as archive:
         members = {info.filename.removesuffix(".npy"): info for info in archive.infolist()}
@@ -111,6 +102,6 @@ def _load(path: str, data: bytes, names: Sequence[str]) -> NDArray[Any]:
         size = members[name].file_size
         if size > MAX_BYTES:
             raise PictureError(f"{path}: {name} has {size:,} bytes", f"take at most {MAX_BYTES:,}")
-        _require_memory(path, size)
+        require_memory(path, MEMORY_FACTOR * size, "save fewer points")
         with archive.open(members[name]) as member:
             return np.load(io.BytesIO(member.read(MAX_BYTES)), allow_pickle=False)

@@ -11,7 +11,7 @@ from mmap import ACCESS_READ, mmap
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, BinaryIO
 
-from taichi_msm.system.process import discarded_output
+from taichi_msm.system.process import available_memory, discarded_output
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -26,6 +26,9 @@ _MODES = ("1", "L", "LA", "P", "PA", "RGB", "RGBA", "RGBa", "RGBX", "CMYK", "YCb
 
 # Largest side [px]. Pillow spends memory and time on every row, even of a single column.
 MAX_SIDE_PX = 65535
+
+# Memory per pixel of a file, while it is decoded and converted [bytes].
+DECODING_BYTES = 20
 
 # Largest file [bytes], larger than Pillow's largest picture with four channels of 16 bits.
 MAX_BYTES = 2**31
@@ -104,6 +107,13 @@ def picture_size(path: str) -> tuple[int, int]:
         if image.format != "TIFF" and Image.Image.getexif(image).get(0x0112) in (5, 6, 7, 8):
             return image.height, image.width
         return image.size
+
+
+def require_memory(path: str, needed: int, remedy: str) -> None:
+    """Raise a PictureError if reading a file needs more memory [bytes] than is free."""
+    if needed > (free := available_memory()):
+        fault = f"{path} needs {needed / 2**20:.3g} MiB of memory, and {free / 2**20:.3g} MiB is free"
+        raise PictureError(fault, remedy)
 
 
 def has_transparency(path: str) -> bool:

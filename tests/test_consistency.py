@@ -181,7 +181,9 @@ def behind_sheet(image: Array, depth: Array, camera: Camera, vertices: Array) ->
     of an orthographic camera where sum b_i c_i = (p, depth), with sum b_i = 1.
     """
     hidden, rays = np.zeros(len(image), bool), np.concatenate([image, np.ones((len(image), 1))], axis=1)
-    corners = camera.to_camera(np.concatenate(list(triangles(vertices))))
+    corners = camera.to_camera(
+        np.concatenate(list(triangles(vertices, np.ones(np.array(vertices.shape[:2]) - 1, bool))))
+    )
     outlines, corners = camera.image_points(corners).reshape(-1, 3, 2), corners.reshape(-1, 3, 3)
     low, high = outlines.min(axis=1), outlines.max(axis=1)
     columns = np.moveaxis(corners if camera.pinhole else np.insert(outlines, 2, 1, axis=2), 1, 2)

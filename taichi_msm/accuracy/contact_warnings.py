@@ -11,7 +11,6 @@ from taichi_msm.arithmetic import NUMPY
 from taichi_msm.model.crossings import cells_on_line
 from taichi_msm.model.plan import Plan
 from taichi_msm.model.rest import rest_of
-from taichi_msm.model.sheet import rest_positions
 from taichi_msm.model.tools import SolidTool, solid_tools
 from taichi_msm.solver.state import RunProgress
 
@@ -48,17 +47,18 @@ def first_piercing_probe(plan: Plan, displacement: NDArray[np.floating], frame: 
     """
     if not plan.has_contact:
         return 0
-    position, time = rest_positions(plan.scene.sheet) + displacement, frame / plan.grid.frames_per_second
-    return next((tool.probe + 1 for tool in solid_tools(plan.tools).values() if _pierces(tool, position, time)), 0)
+    rest, time = rest_of(plan.scene.sheet), frame / plan.grid.frames_per_second
+    position, tools = rest.position + displacement, solid_tools(plan.tools).values()
+    return next((tool.probe + 1 for tool in tools if _pierces(tool, position, rest.present, time)), 0)
 
 
-def _pierces(tool: SolidTool, position: NDArray[np.floating], time: float) -> bool:
+def _pierces(tool: SolidTool, position: NDArray[np.floating], present: NDArray[np.bool_], time: float) -> bool:
     """Return whether the axis of a tool intersects a triangle of the sheet."""
     # Rows: the axis, up to its sign, and two directions orthogonal to it.
     basis = np.linalg.svd(tool.axis[None])[2]
     basis[0] = tool.axis
     local = (position - tool.path_at(np.array([time]))[0]) @ basis.T
-    i, j = np.nonzero(cells_on_line((local[..., 1], local[..., 2])))
+    i, j = np.nonzero(cells_on_line((local[..., 1], local[..., 2])) & present)
     for corner in (local[i, j + 1], local[i + 1, j]):
         triangle = np.stack([local[i, j], corner, local[i + 1, j + 1]], axis=1)
         x, y = triangle[..., 1], triangle[..., 2]
@@ -87,7 +87,10 @@ def _stiffnesses(plan: Plan) -> tuple[float, float]:
         assert scene.springs is not None
         # In plane stress, E t of a lattice of square cells is 8/9 of its structural and shear stiffness together.
         membrane = 8 / 9 * (scene.springs.structural + scene.springs.shear)
+    rest = rest_of(scene.sheet)
+    present = rest.present, True if rest.mask is None else rest.mask.points
     factor, foundation_factor = (
-        1.0 if each is None else float(each.mean()) for each in (material.factors, material.virtual_factors)
+        1.0 if each is None else float(each.mean(where=where))
+        for each, where in zip((material.factors, material.virtual_factors), present, strict=True)
     )
-    return factor * membrane, foundation_factor * material.virtual / rest_of(scene.sheet).cell_area
+    return factor * membrane, foundation_factor * material.virtual / rest.cell_area

@@ -14,6 +14,11 @@ to four times the time-step error, which is usually far smaller than the mesh er
 The estimate is doubled and reported as "at least" if the error may be larger: if the three runs do not converge, or if
 tissue without bending is compressed, which wrinkles more on finer meshes.
 
+With a mask the outline follows the cells. Its distance from the picture's outline is of order 1 in the cell length, and
+varies from mesh to mesh as if by chance, so one difference may be small. Hence the order counts as 1, and the larger of
+both differences counts, the second one scaled to the run with MASK_ORDER. On coarser meshes slits may close and bridges
+vanish; the error is then "at least" the estimate, doubled (docs/decisions/0037).
+
 The force of a tool that is hardly wider than a cell differs from its total, depending on the positions of the mass
 points. The coarser runs have the same force as the run, and its difference from the total is added to the error.
 
@@ -21,7 +26,8 @@ Position-controlled tools touch one mass point after another, and few or none on
 companion run with 1 / sqrt(2) of the cells per side and half the steps. It is compared with the run itself, because a
 coarse time-step companion may have other contacts, and the estimate is CONTACT_ERROR_FACTOR times the difference. A
 difference above SECOND_RUN_DIFFERENCE is unreliable, because the tool may have left one of the two sheets earlier. A
-second companion run with SECOND_CELL_RATIO of the cells per side then follows (docs/decisions/0027).
+second companion run with SECOND_CELL_RATIO of the cells per side then follows (docs/decisions/0027), and with a mask
+always; the estimate is then CONTACT_ERROR_FACTOR times the larger difference.
 
 With `springs`, a sheet with another mesh is a different sheet, so its error is undefined.
 """
@@ -31,16 +37,18 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from functools import lru_cache, partial
-from itertools import product
+from functools import partial
+from itertools import pairwise, product
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from taichi_msm.accuracy.companions import SECOND_CELL_RATIO
+from taichi_msm.accuracy.interpolation import difference, same_outline
 from taichi_msm.accuracy.time_step import max_norm
 from taichi_msm.errors import DivergedError, Pause, ProgressCallback, SceneError
+from taichi_msm.model.mask import Mask
 from taichi_msm.model.plan import Plan
 from taichi_msm.model.rest import rest_of
 from taichi_msm.model.sheet import MAX_CELL_ASPECT, Maps, cell_aspect_ratio
@@ -70,6 +78,9 @@ SECOND_ERROR_FACTOR, SECOND_GRIP_ERROR_FACTOR = 0.8, 1.2
 MAX_DIFFERENCE = 1.0  # largest meaningful difference from the last companion run
 MIN_RADIUS_CELLS = 0.8  # smallest meaningful radius of a tool, in cells of the run
 
+# Order of the difference between coarser runs with a mask: between 1 at the outline and 2 elsewhere.
+MASK_ORDER = 1.5
+
 # Largest refinement of the cells from one trial run of a search to the next.
 MAX_CELL_REFINEMENT = 2.0
 
@@ -81,6 +92,9 @@ NO_CONTACT = "a tool on a path meets no point"
 NARROW_TIP = "the radius of a tool on a path is below 0.8 of a cell, so it touches hardly any point"
 LARGE_STEP_ERROR = "the error of the time step is larger than the largest displacement"
 NOT_CONVERGED = "runs with fewer points do not approach this run"
+NO_COARSER_MESH = "there is no run with fewer points"
+OUTLINE = "with fewer points slits of the mask close or bridges vanish; take more sheet.points"
+SINGLE_RUN = "at an outline, one run with fewer points may agree by chance; --estimate-error adds a second one"
 OVERLAP = "the instruments of two tools run through each other, so the solution is not unique"
 WRINKLING = "tissue without bending wrinkles under compression, and more so with more points"
 
@@ -97,7 +111,8 @@ class MeshEstimate:
 def coarser_plan(plan: Plan, ratio: float = 0.5) -> Plan | None:
     """Plan the scene on a mesh with a ratio of the cells per side, and with the same total forces.
 
-    Return None without tissue, with too few mass points, or with cells that are not allowed.
+    Return None without tissue, with too few mass points, without a cell that is sheet, or with cells that are not
+    allowed.
     """
     scene = plan.scene
     if scene.tissue is None or min(scene.sheet.points) < MIN_POINTS_PER_SIDE:
@@ -115,8 +130,11 @@ def coarser_plan(plan: Plan, ratio: float = 0.5) -> Plan | None:
     if not valid:
         return None
 
-    def deviation(option: Scene) -> float:
-        return sum(abs(count - 1 - cell) for count, cell in zip(option.sheet.points, cells, strict=True))
+    def deviation(option: Scene) -> tuple[bool, float]:
+        few = option.sheet
+        return not same_outline(scene.sheet, few), sum(
+            abs(n - 1 - cell) for n, cell in zip(few.points, cells, strict=True)
+        )
 
     coarse = min(valid, key=lambda option: (deviation(option), option.sheet.points))
     probes = tuple(_with_equal_force(probe, scene.sheet, coarse.sheet) for probe in scene.probes)
@@ -124,6 +142,9 @@ def coarser_plan(plan: Plan, ratio: float = 0.5) -> Plan | None:
 
 
 def _allows_cells(scene: Scene) -> bool:
+    mask = scene.sheet.mask
+    if mask is not None and not Mask.at_cells(mask.pixels.is_sheet, scene.sheet.points).cells.any():
+        return False
     if scene.sheet.surface:
         return not any(surface_problems(scene))
     return cell_aspect_ratio(scene.sheet) <= MAX_CELL_ASPECT
@@ -167,7 +188,7 @@ class MeshCompanion:
     def __init__(
         self, plan: Plan, coarse: Plan, device: Device, cores: int | None = None, step_ratio: float = 0.5
     ) -> None:
-        self._material, steps = plan.material, plan.grid.steps_per_frame
+        self._sheet, self._material, steps = plan.scene.sheet, plan.material, plan.grid.steps_per_frame
         coarsest = None if plan.has_contact else coarser_plan(coarse)
         plans = [coarse] if coarsest is None else [coarse, coarsest]
         self._solvers = []
@@ -177,6 +198,9 @@ class MeshCompanion:
             steps = 1 if plan.scene.time.at_rest else max(math.ceil(steps / 2), min_stable_steps(companion), min_steps)
             in_f64 = companion.with_grid(precision="f64", steps_per_frame=steps)
             self._solvers.append(build_solver(in_f64, device, cores=cores))
+        sheets = [plan.scene.sheet, *(companion.scene.sheet for companion in plans)]
+        self._masked = plan.scene.sheet.mask is not None
+        self._same_outline = all(same_outline(*pair) for pair in pairwise(sheets))
         points = zip(plan.scene.sheet.points, coarse.scene.sheet.points, strict=True)
         # Cells of the run per cell of the first companion run, along a side.
         self._ratio = min((count - 1) / (fewer - 1) for count, fewer in points)
@@ -202,7 +226,7 @@ class MeshCompanion:
         After an exception from `pause`, the companion runs cannot continue.
         """
         self._largest = max(self._largest, max_norm(displacement))
-        finer = displacement
+        finer, sheet = displacement, self._sheet
         for n, solver in enumerate(self._solvers):
             if self._differences[n] == math.inf:
                 return
@@ -213,9 +237,10 @@ class MeshCompanion:
                 return
             reading = solver.read()
             with np.errstate(all="ignore"):
-                difference = max_norm(finer - interpolate(reading.displacement, finer))
-                self._differences[n] = max(self._differences[n], difference)
-            finer = reading.displacement
+                coarse = solver.plan.scene.sheet
+                largest = max_norm(difference(finer, reading.displacement, sheet, coarse))
+                self._differences[n] = max(self._differences[n], largest)
+            finer, sheet = reading.displacement, coarse
             self._shortest_spring = min(self._shortest_spring, reading.shortest_spring)
 
     def tool_forces(self) -> NDArray[np.float64]:
@@ -224,11 +249,15 @@ class MeshCompanion:
 
     def build_second_run(self, plan: Plan, device: Device, cores: int | None = None) -> MeshCompanion | None:
         """Return the second companion run, which begins at the first frame; None if the first one suffices."""
-        if self._contact and not self._unknown and self._relative_difference > SECOND_RUN_DIFFERENCE:
+        if self._contact and not self._unknown and self._needs_second_run:
             coarse = coarser_plan(plan, SECOND_CELL_RATIO)
             if coarse is not None:
                 self._second_run = MeshCompanion(plan, coarse, device, cores, SECOND_CELL_RATIO)
         return self._second_run
+
+    @property
+    def _needs_second_run(self) -> bool:
+        return self._masked or self._relative_difference > SECOND_RUN_DIFFERENCE
 
     @property
     def _relative_difference(self) -> float:
@@ -245,37 +274,48 @@ class MeshCompanion:
             return MeshEstimate(math.inf, "the run with fewer points diverged")
         if self._contact:
             return self._contact_estimate(first / self._largest)
-        order, doubt = 1.0, ""
+        order = 1.0
         if others and first > 0:
             order = math.log(others[0] / first) / math.log(self._ratio) if others[0] > 0 else -math.inf
-        if not 1 <= order <= 3:
-            doubt = "runs with fewer points do not converge"
-        elif self._may_wrinkle:
-            doubt = WRINKLING
+        converges = order >= 0 if self._masked else 1 <= order <= 3
+        doubt = self._doubt if converges else "runs with fewer points do not converge"
+        if self._masked:
+            first, order = max([first, *(other / self._ratio**MASK_ORDER for other in others)]), 1.0
         # An order above 2 counts as 2 minus a quarter of the excess (docs/decisions/0022).
         assumed_order = max(1.0, min(order, 2 - (order - 2) / 4))
         relative = first / (self._ratio**assumed_order - 1) / self._largest
-        return MeshEstimate((2 if doubt else 1) * relative + self._sampling_error, doubt)
+        # Order 1 already includes wrinkles.
+        certain = not doubt or (self._masked and doubt == WRINKLING)
+        return MeshEstimate((1 if certain else 2) * relative + self._sampling_error, doubt)
 
     @property
-    def _may_wrinkle(self) -> bool:
+    def _doubt(self) -> str:
+        """Reason for a larger error than that of converging runs; empty without one."""
+        second = self._second_run
+        if not (self._same_outline and (second is None or second._same_outline)):
+            return OUTLINE
+        if self._masked and self._contact and second is None:
+            return SINGLE_RUN
         # The shortest spring is compressed by more than 1e-4 of its rest length.
         compressed = self._shortest_spring < 1 - self._material.tension - 1e-4
-        return self._material.bending == 0 and compressed
+        return WRINKLING if self._material.bending == 0 and compressed else ""
 
     def _contact_estimate(self, difference: float) -> MeshEstimate:
         """Estimate the error from the relative difference of the first companion run."""
         if self._unknown:
             return MeshEstimate(math.inf, self._unknown)
         error = CONTACT_ERROR_FACTOR * difference
-        if difference > SECOND_RUN_DIFFERENCE:
+        if self._needs_second_run:
             second = math.inf if self._second_run is None else self._second_run._relative_difference
             factor = SECOND_GRIP_ERROR_FACTOR if self._grips else SECOND_ERROR_FACTOR
-            if second <= MAX_DIFFERENCE:
-                error = factor * math.sqrt(min(difference, MAX_DIFFERENCE_RATIO * second) * second)
+            limited = min(difference, MAX_DIFFERENCE_RATIO * second)
+            if second <= MAX_DIFFERENCE and self._masked:
+                error = CONTACT_ERROR_FACTOR * max(limited, second)
+            elif second <= MAX_DIFFERENCE:
+                error = factor * math.sqrt(limited * second)
             elif self._second_run is not None or difference > UNRELIABLE_DIFFERENCE:
                 return MeshEstimate(math.inf, NOT_CONVERGED)
-        return MeshEstimate(error + self._sampling_error, WRINKLING if self._may_wrinkle else "", at_most=True)
+        return MeshEstimate(error + self._sampling_error, self._doubt, at_most=True)
 
 
 def with_points(scene: Scene, points: tuple[int, int]) -> Scene:
@@ -313,7 +353,7 @@ def choose_points(
         # The error decreases at most with the square of the cell length. A target of 0.8 of the tolerance leads to
         # nearly the coarsest mesh.
         needed = refinement * math.sqrt(estimate.error / (0.8 * tolerance))
-        if estimate.doubt in (NARROW_TIP, NOT_CONVERGED) and needed == math.inf:
+        if estimate.doubt in (NARROW_TIP, NOT_CONVERGED, NO_COARSER_MESH) and needed == math.inf:
             needed = MAX_CELL_REFINEMENT * refinement  # On a finer mesh the error is known.
         if needed > max_refinement:
             break
@@ -331,9 +371,10 @@ def choose_points(
 
 
 def estimate_mesh_error(plan: Plan, device: Device, progress: ProgressCallback) -> MeshEstimate:
-    """Return the mesh error of a scene with a `mesh_companion_plan`, by a run and its companion runs, all in f64."""
+    """Return the mesh error of a scene, by a run and its companion runs, all in f64."""
     in_f64, coarse, grid = plan.with_grid(precision="f64"), mesh_companion_plan(plan), plan.grid
-    assert coarse is not None
+    if coarse is None:
+        return MeshEstimate(math.inf, NO_COARSER_MESH)
     first = MeshCompanion(in_f64, coarse, device)
     companion: MeshCompanion | None = first
     while companion is not None:
@@ -345,29 +386,3 @@ def estimate_mesh_error(plan: Plan, device: Device, progress: ProgressCallback) 
             companion.compare_frame(dynamics.displacement(), pause)
         companion = first.build_second_run(in_f64, device) if companion is first else None
     return first.estimate
-
-
-def interpolate(displacement: NDArray[Any], target: NDArray[Any]) -> NDArray[np.float64]:
-    """Interpolate displacements [m], shape (rows, cols, 3), at least 4 x 4, by cubics at the nodes of another lattice.
-
-    The values of `target` do not matter, only its shape.
-    """
-    for count, target_count in zip(displacement.shape[:2], target.shape[:2], strict=True):
-        first, weights = _cubic_weights(count - 1, target_count - 1)
-        nodes = (weight[:, None, None] * displacement[first + n] for n, weight in enumerate(weights))
-        displacement = sum(nodes, start=np.zeros(())).swapaxes(0, 1)
-    return displacement
-
-
-@lru_cache(maxsize=64)
-def _cubic_weights(source: int, target: int) -> tuple[NDArray[np.intp], NDArray[np.float64]]:
-    """Return the interpolation along a side from `source` to `target` cells.
-
-    These are the index of the first of four neighbouring source nodes of every target node, shape (target + 1,), and
-    the weights of the four, shape (4, target + 1).
-    """
-    position = np.arange(target + 1) * (source / target)
-    first = np.clip(np.floor(position).astype(int) - 1, 0, source - 3)
-    t, nodes = position - first, range(4)
-    weights = [math.prod((t - zero) / (node - zero) for zero in nodes if zero != node) for node in nodes]
-    return first, np.stack(weights)

@@ -15,6 +15,7 @@ from taichi_msm.accuracy.buckling import buckling_warnings
 from taichi_msm.accuracy.companions import NEGLIGIBLE_ERROR, QUASISTATIC_REASON, CompanionRuns
 from taichi_msm.accuracy.contact_warnings import tool_contact_warnings
 from taichi_msm.accuracy.divergence import energy_growth_warnings
+from taichi_msm.accuracy.mask import mask_notes
 from taichi_msm.accuracy.mesh import (
     LARGE_STEP_ERROR,
     MAX_DIFFERENCE,
@@ -49,6 +50,10 @@ FORCE_ERROR_FACTOR = 1.15
 # both runs may be equal by chance. The largest one, with contact, is the error of the displacement
 # (docs/decisions/0027).
 MIN_FORCE_ERROR_FACTOR = 0.4
+
+# The same with a mask, because at an outline the forces depend on its position as much as the displacement does
+# (docs/decisions/0037).
+MIN_MASK_FORCE_ERROR_FACTOR = 0.7
 
 # Smallest relative error of the force of a grip, as a multiple of the cell's side over the radius of the tool: the edge
 # of the held points is uncertain by a part of a cell, and in a pull along the sheet the displacement far more.
@@ -100,6 +105,7 @@ class RunErrorEstimator:
         reference = plan.with_grid(steps_per_frame=steps) if self._mesh_follows_coarse else plan
         self._mesh = None if coarse is None else MeshCompanion(reference, coarse, device, cores)
         self._squared_errors, self._contact_frames, self._max_force = np.zeros((3, len(plan.tools)))
+        self._forces: list[NDArray[np.float64]] = []  # of the tools since the previous frame, at every frame
 
     def compile(self) -> None:
         """Compile the kernels before the first frame."""
@@ -120,6 +126,7 @@ class RunErrorEstimator:
             self._mesh.compare_frame(coarse.displacement if coarse else displacement, pause)
         if self._plan.tools and self._mesh is not None:
             coarse_forces = self._mesh.tool_forces()
+            self._forces.append(forces)
             error = FORCE_ERROR_FACTOR * np.abs(forces - coarse_forces)
             if self._time_step is not None:
                 error = np.maximum(error, self._time_step.force_error(forces))
@@ -142,10 +149,15 @@ class RunErrorEstimator:
         companions = [companion for companion in (fine, second_mesh) if companion is not None]
         if not companions:
             return
-        frames = self._plan.grid.frames
+        frames, squared_errors = self._plan.grid.frames, np.zeros(len(self._plan.tools))
         for frame, displacement in enumerate(displacements or self._repeated(), 1):
             for companion in companions:
                 companion.compare_frame(displacement, partial(progress, frame, frames))
+            # At an outline the forces of one companion run may agree by chance.
+            if second_mesh is not None and self._plan.scene.sheet.mask is not None:
+                error = FORCE_ERROR_FACTOR * (self._forces[frame - 1] - second_mesh.tool_forces())
+                squared_errors += (error**2).sum(axis=1)
+        self._squared_errors = np.maximum(self._squared_errors, squared_errors)
         if first is not None and fine is not None:
             self._known = self._known._replace(time_step=combine_estimates(first.estimate, fine.estimate))
 
@@ -188,7 +200,8 @@ class RunErrorEstimator:
         relative = float(root_mean_square / self._max_force.max())
         if relative > FORCE_ERROR_FACTOR * MAX_DIFFERENCE:
             return ForceEstimate(None, NOT_CONVERGED)
-        smallest = MIN_FORCE_ERROR_FACTOR * mesh.error
+        masked = self._plan.scene.sheet.mask is not None and self._plan.has_contact
+        smallest = (MIN_MASK_FORCE_ERROR_FACTOR if masked else MIN_FORCE_ERROR_FACTOR) * mesh.error
         if radii := [tool.radius for tool in solid_tools(self._plan.tools).values() if tool.grips]:
             smallest = min(
                 smallest, GRIP_FORCE_ERROR_FACTOR * rest_of(self._plan.scene.sheet).longest_side / min(radii)
@@ -235,6 +248,7 @@ def run_warnings(
         else:
             yield f"force error at most about {_percent(force.error, 2)} % of the greatest force"
     yield from surface_notes(scene)
+    yield from mask_notes(plan)
     yield from tool_force.force_warnings(scene, probes)
     tool_warnings = list(path_warnings(scene, plan.tools))
     yield from tool_warnings

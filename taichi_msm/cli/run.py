@@ -115,6 +115,7 @@ def _require_no_settings(action: str, allowed: Sequence[str]) -> None:
 @options.json_option
 def check(scene: str, image: str | None, overrides: tuple[str, ...], as_json: bool) -> None:
     """Validate SCENE, and print the steps, time, memory and disk space that it needs."""
+    from taichi_msm.accuracy.mask import describe_mask, mask_notes, mask_record
     from taichi_msm.accuracy.surface import describe_surface, surface_notes, surface_record
     from taichi_msm.load import cost
     from taichi_msm.load.scene_file import load_plan
@@ -141,6 +142,7 @@ def check(scene: str, image: str | None, overrides: tuple[str, ...], as_json: bo
         "probes": (records := probe_records(loaded)),
         "notes": [
             *surface_notes(loaded),
+            *mask_notes(plan),
             *force_warnings(loaded, records),
             *path_warnings(loaded, plan.tools),
             *drawing_warnings(loaded),
@@ -148,6 +150,8 @@ def check(scene: str, image: str | None, overrides: tuple[str, ...], as_json: bo
     }
     if surface := surface_record(loaded):
         report["surface"] = surface
+    if mask := mask_record(loaded):
+        report["mask"] = mask
     import yaml
 
     tolerances = [f"{name}.tolerance" for name in ("sheet", "time") if getattr(loaded, name).tolerance is not None]
@@ -168,6 +172,7 @@ def check(scene: str, image: str | None, overrides: tuple[str, ...], as_json: bo
         f"{math.prod(loaded.sheet.points)} points, {budget.frames} frames, {stepping}",
         f"about {cost.format_rough_time(duration.seconds)} to run{longer} (estimated from its work)",
         f"about {memory:.0f} MiB of memory, at most {disk:.1f} MiB on disk, {working:.1f} MiB more while it runs",
+        *describe_mask(loaded),
         *describe_surface(plan),
         *describe_cameras(loaded),
         *(f"probes.{index}: {description}" for index, description in forces if description),

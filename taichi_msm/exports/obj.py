@@ -16,7 +16,14 @@ from numpy.typing import NDArray
 
 from taichi_msm.errors import ProgressCallback
 from taichi_msm.exports.formats import one_folder_per_run
-from taichi_msm.exports.inputs import EXPORT_REFINE, FLOAT32_FORMAT, PICTURE_FILE, picture_png, unit_normals
+from taichi_msm.exports.inputs import (
+    EXPORT_REFINE,
+    FLOAT32_FORMAT,
+    PICTURE_FILE,
+    mass_points,
+    picture_png,
+    unit_normals,
+)
 from taichi_msm.model.surface import refine_surface
 from taichi_msm.runs.directory import create_file, write_new_file
 from taichi_msm.runs.finished import FinishedRun
@@ -25,13 +32,13 @@ MATERIAL_FILE = "surface.mtl"
 
 
 def _write_run(run: FinishedRun, folder: Path, progress: ProgressCallback) -> list[str]:
-    positions, picture = run.positions(), picture_png(run)
+    positions, mask, picture = run.positions(), run.mask(), picture_png(run)
     if picture is not None:
         write_new_file(folder / PICTURE_FILE, picture)
     # A matte material.
     material = ["newmtl sheet", "Kd 1 1 1", "Ks 0 0 0", "illum 1", *([f"map_Kd {PICTURE_FILE}"] if picture else [])]
     write_new_file(folder / MATERIAL_FILE, "".join(f"{line}\n" for line in material).encode())
-    first = refine_surface(positions[0], EXPORT_REFINE)
+    first = refine_surface(positions[0], EXPORT_REFINE, mask)
     coordinates = _lines("vt", first.texture_coordinates * (1, -1) + (0, 1))
     corners = np.repeat(first.triangles + 1, 3, axis=1)
     faces = ("f %d/%d/%d %d/%d/%d %d/%d/%d\n" * len(corners)) % tuple(corners.ravel().tolist())
@@ -39,9 +46,9 @@ def _write_run(run: FinishedRun, folder: Path, progress: ProgressCallback) -> li
         progress(frame, run.frames)
         with io.TextIOWrapper(create_file(folder / f"{frame:04}.obj"), "ascii", newline="") as file:
             file.write(f"# {run.time[frame]:g} s, in metres\nmtllib {MATERIAL_FILE}\n")
-            file.write(_lines("v", position.reshape(-1, 3)))
+            file.write(_lines("v", mass_points(position, mask)))
             file.write(coordinates)
-            file.write(_lines("vn", unit_normals(position)))
+            file.write(_lines("vn", unit_normals(position, mask)))
             file.write(f"usemtl sheet\n{faces}")
     return []
 

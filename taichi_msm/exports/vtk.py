@@ -1,7 +1,7 @@
 """VTK export for ParaView: an unstructured grid per frame (.vtu), and a collection of the grids with times (.pvd).
 
-The points of a grid are the mass points in row-major order from the top left, and its triangles are those of the
-rendered surface. The data of each point are
+The points of a grid are the mass points of the sheet in row-major order from the top left, and its triangles are those
+of the rendered surface. The data of each point are
 
     displacement     from the rest position [m]
     speed            central difference of the displacements in the adjacent frames [m/s]
@@ -26,9 +26,9 @@ from numpy.typing import NDArray
 
 from taichi_msm.errors import ProgressCallback
 from taichi_msm.exports.formats import one_folder_per_run
-from taichi_msm.exports.inputs import EXPORT_REFINE, PICTURE_FILE, picture_png
+from taichi_msm.exports.inputs import EXPORT_REFINE, PICTURE_FILE, mass_points, picture_png
 from taichi_msm.model.sheet import rest_positions
-from taichi_msm.model.surface import refine_surface
+from taichi_msm.model.surface import Surface, refine_surface
 from taichi_msm.runs.directory import write_new_file
 from taichi_msm.runs.finished import FinishedRun
 from taichi_msm.solver.planning import make_plan
@@ -41,7 +41,7 @@ Array = NDArray[np.floating]
 
 
 def _write_run(run: FinishedRun, folder: Path, progress: ProgressCallback) -> list[str]:
-    positions, picture = run.positions(), picture_png(run)
+    positions, mask, picture = run.positions(), run.mask(), picture_png(run)
     run.require_same_pictures(drawn=False)
     plan, rest = make_plan(run.scene), rest_positions(run.scene.sheet)
     collection = Element("VTKFile", type="Collection", version="0.1")
@@ -50,11 +50,13 @@ def _write_run(run: FinishedRun, folder: Path, progress: ProgressCallback) -> li
         progress(frame, run.frames)
         displacement, name = positions[frame] - rest, f"{frame:04}.vtu"
         values = {
-            "displacement": displacement.reshape(-1, 3),
-            "speed": speed(positions, run.time, frame).ravel(),
-            "energy_density": energy_density(plan, displacement).ravel(),
+            "displacement": displacement,
+            "speed": speed(positions, run.time, frame),
+            "energy_density": energy_density(plan, displacement),
         }
-        write_new_file(folder / name, _document(_grid(positions[frame], values)))
+        values = {key: mass_points(array, mask) for key, array in values.items()}
+        mesh = refine_surface(positions[frame], EXPORT_REFINE, mask)
+        write_new_file(folder / name, _document(_grid(mesh, values)))
         SubElement(files, "DataSet", timestep=repr(seconds), part="0", file=name)
     if picture is not None:
         write_new_file(folder / PICTURE_FILE, picture)
@@ -80,16 +82,15 @@ def speed(positions: Array, time: Array, frame: int) -> Array:
     return np.linalg.norm(displacement, axis=-1) / (time[after] - time[frame - 1])
 
 
-def _grid(position: Array, values: dict[str, Array]) -> Element:
+def _grid(mesh: Surface, values: dict[str, Array]) -> Element:
     """Build a .vtu file with point data in the precision of the run."""
-    mesh = refine_surface(position, EXPORT_REFINE)
     root = Element("VTKFile", type="UnstructuredGrid", version="1.0", byte_order="LittleEndian")
     root.attrib |= {"header_type": "UInt64", "compressor": "vtkZLibDataCompressor"}
     sizes = {"NumberOfPoints": str(len(mesh.vertices)), "NumberOfCells": str(len(mesh.triangles))}
     piece = SubElement(SubElement(root, "UnstructuredGrid"), "Piece", sizes)
     data = SubElement(piece, "PointData", Vectors="displacement", TCoords="texture")
     for name, array in {**values, "texture": mesh.texture_coordinates * (1, -1) + (0, 1)}.items():
-        _add_array(data, name, array.astype(position.dtype))
+        _add_array(data, name, array.astype(mesh.vertices.dtype))
     _add_array(SubElement(piece, "Points"), "points", mesh.vertices)
     cells = SubElement(piece, "Cells")
     _add_array(cells, "connectivity", mesh.triangles.reshape(-1).astype(np.int64))

@@ -9,14 +9,16 @@ from __future__ import annotations
 import math
 from abc import abstractmethod
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import ClassVar, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+from typing_extensions import Self
 
 from taichi_msm.arithmetic import Array
+from taichi_msm.errors import SceneError
 from taichi_msm.fitting import observation, rejection
 from taichi_msm.fitting.observation import ErrorCorrelation, Observation, ObservationModel
 from taichi_msm.fitting.panels import Panel, plot_match, plot_motion, plot_on_sheet
@@ -110,6 +112,7 @@ class PointObservation(Observation):
 
     sigma: float | None
     coordinates: Array  # across and down as fractions of the sheet, shape (N, 2)
+    off_sheet: int = 0  # number of points that `on_sheet` left out
 
     @property
     def is_observed(self) -> NDArray[np.bool_]:
@@ -120,6 +123,16 @@ class PointObservation(Observation):
     def subject(self) -> str:
         """Subject of messages: file and array."""
         return f"{self.name}: {self.kind}"
+
+    def on_sheet(self, scene: Scene) -> Self:
+        """Return a copy without the points that fall on no sheet; raise a SceneError if none remains."""
+        if (mask := rest_of(scene.sheet).mask) is None or (covered := mask.covers(self.coordinates)).all():
+            return self
+        if not self.is_observed[covered].any():
+            fault = "all observed points fall on no sheet"
+            raise SceneError([f"{self.name}: coordinates: {fault}; compare them with the white pixels of sheet.mask"])
+        values, coordinates = self.values[covered], self.coordinates[covered]
+        return replace(self, values=values, coordinates=coordinates, off_sheet=int((~covered).sum()))
 
     def build_model(self, scene: Scene, frames: int) -> PointModel:
         return PointModel(scene, self, frames)
@@ -233,6 +246,9 @@ class PointObservation(Observation):
         return np.tensordot(by_track, correlated, ((0, 1, 2), (0, 1, 2))), square
 
     def residual_notes(self, predicted: Array, signal: float, correlation: ErrorCorrelation) -> Iterator[str]:
+        if self.off_sheet:
+            count = self.off_sheet + len(self.coordinates)
+            yield f"{self.off_sheet} of {count} points fall on no sheet, see sheet.mask, and are left out"
         residuals = predicted - self.values
         if np.sqrt(np.nanmean(residuals**2)) < max(1e-6 * signal, 0.1 * (self.sigma or 0.0)):
             if self.sigma is None:

@@ -29,10 +29,12 @@ _NUMBERS = "fit numbers instead of a map, or take finite differences"
 
 
 def require_differentiable(plan: Plan) -> None:
-    """Raise a SceneError if a scene has a curved sheet, a position-controlled tool or a term without a gradient."""
+    """Raise a SceneError if a sheet is curved or has a mask, or for a tool with a path or a term without a gradient."""
     if plan.scene.sheet.surface:
         reason = "a sheet that is curved at rest has no gradient"
         raise SceneError([f"sheet.surface: {reason}; {_NUMBERS}"])
+    if plan.scene.sheet.mask:
+        raise SceneError([f"sheet.mask: a sheet with a mask has no gradient; {_NUMBERS}"])
     for tool in plan.tools:
         reason = "a tool with a path has no gradient, as its contact begins and ends"
         raise SceneError([f"probes.{tool.probe}.path: {reason}; {_NUMBERS}"])
@@ -128,7 +130,7 @@ def gradient(scene: Scene | Mapping[str, Any], loss: Loss, threads: int | None =
         The value of the loss and its derivatives.
 
     Raises:
-        SceneError: when the scene cannot be run, or a tool has a path.
+        SceneError: when the scene cannot be run, a tool has a path, or the sheet has a surface or a mask.
         ArgumentError: when the loss does not return a number and such an array.
         DivergedError: when the simulation diverges.
         MsmError: when the stiffness of a quasi-static sheet is singular.

@@ -21,6 +21,7 @@ import numpy as np
 
 from taichi_msm.accuracy.companions import choose_companion_runs
 from taichi_msm.errors import Problem, SceneError
+from taichi_msm.images import DECODING_BYTES
 from taichi_msm.model.plan import Plan
 from taichi_msm.model.time_grid import DTYPES
 from taichi_msm.render import texture
@@ -49,7 +50,6 @@ POINT_BYTES = 36  # per mass point: its projection and its normal
 SAMPLE_BYTES = 48  # per sample, upper bound
 BAND_ROWS = 16  # rows of samples that a thread processes at a time
 PIXEL_BYTES = 3 * 12  # per pixel of the frame: its colours, as sums, averages and bytes
-IMAGE_PIXEL_BYTES = 20  # per pixel of the image file, while it is decoded and converted; its texture takes less
 DISTORTION_BYTES = 100  # per sample with lens distortion, while the undistortion map is computed and copied
 VIDEO_PIXEL_BYTES = 80  # per pixel of a video, mostly in the frames of the encoder's look-ahead
 LABEL_PIXEL_BYTES = 60  # per pixel with labels
@@ -67,7 +67,7 @@ FORCE_BYTES = 6 * 8  # values in the checkpoint
 
 # Numbers in memory per mass point.
 STATE_NUMBERS = 6  # displacement and last difference
-CURVED_NUMBERS = 12  # of a curved sheet: mobility, rest position, stiffness and tension of four springs
+CURVED_NUMBERS = 12  # with a surface or mask: mobility, rest position, stiffness and tension of four springs
 CURVED_BYTES = 500  # of a curved sheet at rest, with its cells and temporary arrays
 MAP_NUMBERS = {"map": 6, "foundation_map": 4}  # stiffness of three springs; factor of the foundation; temporary arrays
 OUTPUT_NUMBERS = 15  # copies at the start and for output
@@ -128,16 +128,17 @@ def estimate_budget(plan: Plan) -> Budget:
     surface = scene.sheet.surface
     surface_bytes = surface.file.values.nbytes if surface and surface.file else 0
     surface_bytes += CURVED_BYTES * points * (surface is not None)
+    mask_bytes = scene.sheet.mask.pixels.is_sheet.nbytes if scene.sheet.mask else 0
     memory_numbers = len(memory_names(plan))
     numbers = STATE_NUMBERS + OUTPUT_NUMBERS + memory_numbers + sum(MAP_NUMBERS[name] for name in scene.maps)
-    numbers += CURVED_NUMBERS * (surface is not None)
+    numbers += CURVED_NUMBERS * (surface is not None or scene.sheet.mask is not None)
     numbers += sum(not probe.moved for probe in scene.probes)  # the load of each force-controlled tool
     # Companion runs add up to two sheets in f64, and with tissue two smaller ones.
     has_companions = scene.time.tolerance is not None or choose_companion_runs(plan).planned
     bytes_per_number = number_bytes + (8 * (2 + (scene.tissue is not None) * 5 / 16) if has_companions else 0)
     return Budget(
         frames=frames,
-        simulation_bytes=round(points * bytes_per_number * numbers) + surface_bytes,
+        simulation_bytes=round(points * bytes_per_number * numbers) + surface_bytes + mask_bytes,
         drawing_bytes=drawing_bytes(scene) if scene.renders else 0,
         track_bytes=track_bytes,
         picture_bytes=math.ceil(frames * frame_bytes),
@@ -200,7 +201,7 @@ def require_disk(plan: Plan, directory: Path) -> None:
 def drawing_bytes(scene: Scene) -> int:
     """Estimate the memory for drawing a frame [bytes], also for scenes without pictures in their output."""
     width, height = scene.render.size
-    # The whole image is decoded, even if only a region of it is used.
+    # The whole image is decoded, even if only a region of it is used. Its texture takes less.
     image_pixels = math.prod(texture.image_size(scene) or (0,))
     factor = scene.render.supersample
     band_rows = min(height * factor, BAND_ROWS * (os.cpu_count() or 1))
@@ -214,7 +215,7 @@ def drawing_bytes(scene: Scene) -> int:
     pixel_bytes += VIDEO_PIXEL_BYTES if "mp4" in scene.output else 0
     pixels = width * height * len(cameras)
     point_bytes = math.prod(scene.sheet.points) * POINT_BYTES
-    return point_bytes + sample_bytes + pixels * pixel_bytes + image_pixels * IMAGE_PIXEL_BYTES
+    return point_bytes + sample_bytes + pixels * pixel_bytes + image_pixels * DECODING_BYTES
 
 
 def _free_disk(directory: Path) -> int:

@@ -207,6 +207,9 @@ class Draft:
         """Apply an override."""
         self._overrides += 1
         origin = _Origin(self._overrides, Mark(1, 1), override.name)
+        mask = value_at(self.data, MASK_KEYS[0])
+        if isinstance(mask, str) and override.path[:2] == MASK_KEYS[0] != override.path:
+            self.data["sheet"]["mask"] = {"image": mask}
         if override.problems:
             self.problems += [(origin, problem) for problem in override.problems]
         elif problem := self._set_value(override.path, override.value, origin):

@@ -49,6 +49,11 @@ class Rest(ABC):
         """Lower and upper corner of the sheet's box [m], shape (2, 3)."""
         return np.stack([self.present_positions.min(axis=0), self.present_positions.max(axis=0)])
 
+    @cached_property
+    def unmasked_box(self) -> Array:
+        """Lower and upper corner of the box of all mass points, with and without sheet [m], shape (2, 3)."""
+        return np.stack([self.position.min(axis=(0, 1)), self.position.max(axis=(0, 1))])
+
     @property
     def sides(self) -> tuple[float, float]:
         """Height and width of the sheet, on a curved one means of its lengths along columns and rows [m]."""
@@ -102,6 +107,18 @@ class Rest(ABC):
         """Fractions across and down at the mass points, which broadcast to shape (rows, cols)."""
         rows, cols = self.position.shape[:2]
         return np.arange(cols) / (cols - 1), (np.arange(rows) / (rows - 1))[:, None]
+
+    def mesh_positions(self, mesh: Array) -> Array:
+        """Return the positions at (u, v) [m], shape (n, 3) from (n, 2)."""
+        return self.place(self.coordinates(mesh))
+
+    def refined(self, refine: int) -> Array:
+        """Return points of the sheet [m], shape (n, 3), with `refine` between neighbouring mass points."""
+        across, down = (np.linspace(0, 1, (count - 1) * (refine + 1) + 1) for count in self.position.shape[1::-1])
+        mesh = np.stack(np.meshgrid(across, down), axis=-1)
+        if self.mask is not None:
+            mesh = mesh[Mask(np.kron(self.mask.cells, np.ones((refine + 1, refine + 1), bool))).points]
+        return self.mesh_positions(mesh.reshape(-1, 2))
 
     @abstractmethod
     def place(self, coordinates: Array) -> Array:
@@ -245,10 +262,8 @@ class CurvedRest(Rest):
     def normals(self, coordinates: Array) -> Array:
         return unit(self._interpolate(self.point_normals, self.mesh_places(coordinates)))
 
-    def refined(self, refine: int) -> Array:
-        """Return points of the sheet [m], shape (n, 3), with `refine` between neighbouring mass points."""
-        across, down = (np.linspace(0, 1, (count - 1) * (refine + 1) + 1) for count in self.position.shape[1::-1])
-        return self._interpolate(self.position, np.stack(np.meshgrid(across, down), axis=-1).reshape(-1, 2))
+    def mesh_positions(self, mesh: Array) -> Array:
+        return self._interpolate(self.position, mesh)
 
     load_points = place
 

@@ -5,12 +5,17 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cached_property
+from itertools import product
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from taichi_msm.arithmetic import Array
 from taichi_msm.model.cells import sum_around_points
+
+# Places this close to an edge of a cell, in sides of a cell, are on it.
+EDGE_TOLERANCE = 1e-9
 
 
 @dataclass(frozen=True, eq=False)
@@ -47,9 +52,54 @@ class Mask:
 
         return np.asarray(label(self.cells)[0])
 
+    @cached_property
+    def topology(self) -> tuple[int, int, bool]:
+        """Number of parts and of holes, and whether two parts meet in a point."""
+        from scipy.ndimage import label
+
+        outside = np.pad(~self.cells, 1, constant_values=True)
+        return int(self.parts.max()), label(outside, np.ones((3, 3)))[1] - 1, any(self.pinched_points())
+
     def points_of(self, part: int) -> NDArray[np.bool_]:
         """Return whether each mass point belongs to a part."""
         return sum_around_points(self.parts == part) > 0
+
+    def parts_with(self, points: NDArray[np.bool_]) -> set[int]:
+        """Return the parts with any of the mass points, a mask of shape (rows, cols)."""
+        corners = points[:-1, :-1] | points[:-1, 1:] | points[1:, :-1] | points[1:, 1:]
+        return set(np.unique(self.parts[corners & self.cells]).tolist())
+
+    def covers(self, places: Array, tolerance: float = EDGE_TOLERANCE) -> NDArray[np.bool_]:
+        """Return whether places are on the sheet or its outline, from fractions across and down of shape (n, 2)."""
+        rows, cols = self.cells.shape
+        at, covered = np.asarray(places, float) * (cols, rows), np.zeros(len(places), bool)
+        # A place on an edge belongs to the cells on both sides.
+        for shift in product((-tolerance, tolerance), repeat=2):
+            j, i = np.floor(at + shift).astype(int).T
+            inside = (i >= 0) & (i < rows) & (j >= 0) & (j < cols)
+            covered |= inside & self.cells[i.clip(0, rows - 1), j.clip(0, cols - 1)]
+        return covered
+
+    def nearest_cells(self, i: NDArray[Any], j: NDArray[Any], places: Array) -> tuple[NDArray[Any], NDArray[Any]]:
+        """Return rows and columns of the cells (i, j) of places, or of the nearest cells where there is no sheet."""
+        from scipy.ndimage import distance_transform_edt
+
+        covered = self.covers(places)
+        rows, cols = distance_transform_edt(~self.cells, return_distances=False, return_indices=True)
+        return np.where(covered, i, rows[i, j]), np.where(covered, j, cols[i, j])
+
+    def first_gap(self, start: Array, end: Array) -> float | None:
+        """Return the fraction of a line between two places, as for `covers`, at which it leaves the sheet, or None."""
+        (rows, cols), offset = self.cells.shape, end - start
+        crossings = [np.array([0.0, 1.0])]
+        for axis, count in enumerate((cols, rows)):
+            if offset[axis]:
+                crossings.append((np.arange(count + 1) / count - start[axis]) / offset[axis])
+        # Between two crossings the line is in one cell.
+        cuts = np.unique(np.concatenate(crossings).clip(0, 1))
+        middles = np.concatenate([[0.0], (cuts[1:] + cuts[:-1]) / 2, [1.0]])
+        gaps = np.flatnonzero(~self.covers(start + middles[:, None] * offset))
+        return float(middles[gaps[0]]) if gaps.size else None
 
     def pinched_points(self) -> Iterator[tuple[int, int]]:
         """Yield row and column of the mass points at which two parts meet."""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -106,20 +107,29 @@ class Plan:
     @property
     def mobility(self) -> Array:
         """Inverse mass of each mass point in units of a cell's, 0 if it is fixed, shape (rows, cols)."""
-        if not (self.areas_vary and self.material.by_area):
-            return ~self.fixed / 1.0
-        return ~self.fixed / np.where(self.fixed, 1.0, self.area_shares)
+        shares = self.area_shares if self.areas_vary and self.material.by_area else 1.0
+        # A point without sheet has no area.
+        return ~self.fixed / np.where(self.fixed, 1.0, shares)
 
     @property
     def areas_vary(self) -> bool:
         """Whether mass points that can move have different areas."""
         return self.open_edges or self.material.shares is not None
 
+    @cached_property
+    def loose_parts(self) -> tuple[int, ...]:
+        """Parts of a masked sheet, see `Mask.parts`, without a fixed or clamped mass point."""
+        mask, held = rest_of(self.scene.sheet).mask, self.fixed.copy()
+        if mask is None:
+            return ()
+        for clamp in clamps(self.tools).values():
+            held |= clamp.points
+        return tuple(sorted({*range(1, int(mask.parts.max()) + 1)} - mask.parts_with(held)))
+
     @property
     def is_held(self) -> bool:
-        """Whether any mass point of the sheet is fixed or clamped."""
-        mask = rest_of(self.scene.sheet).mask
-        return bool((self.fixed if mask is None else self.fixed & mask.points).any()) or bool(clamps(self.tools))
+        """Whether any mass point of the sheet, and of each of its parts, is fixed or clamped."""
+        return not self.loose_parts and (bool(self.fixed.any()) or bool(clamps(self.tools)))
 
     @property
     def has_contact(self) -> bool:

@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from taichi_msm.arithmetic import Array
+from taichi_msm.model.mask import Mask
 from taichi_msm.model.rest import rest_of
 from taichi_msm.model.tool_force import control_point
 from taichi_msm.model.tools import build_tools, solid_tools, unit_vector
@@ -53,10 +54,10 @@ def surface_positions(position: NDArray[np.floating], refine: int, coordinates: 
 def surface_weights(coordinates: Array, sheet: Sheet, refine: int) -> tuple[NDArray[np.intp], Array]:
     """Return the four mass points around each point of `surface_positions`, and their weights, shape (n, 4) each.
 
-    Mass points are numbered row by row.
+    Mass points are numbered row by row. A point on no sheet, as of a coarser mesh, continues the nearest cell.
     """
     cols = sheet.points[1]
-    i, j, s, t, twist = _cell_coordinates(coordinates, sheet.points, refine)
+    i, j, s, t, twist = _cell_coordinates(coordinates, sheet.points, refine, rest_of(sheet).mask)
     first = i * cols + j
     corners = np.stack([first, first + 1, first + cols, first + cols + 1], axis=1)
     return corners, np.stack([1 - s - t + twist, s - twist, t - twist, twist], axis=1)
@@ -72,7 +73,9 @@ def _interpolate(position: NDArray[np.floating], refine: int, coordinates: Array
     return a + b * s + c * t + d * twist, np.cross(b + d * t, -(c + d * s))
 
 
-def _cell_coordinates(coordinates: Array, points: tuple[int, int], refine: int) -> tuple[NDArray[Any], ...]:
+def _cell_coordinates(
+    coordinates: Array, points: tuple[int, int], refine: int, mask: Mask | None = None
+) -> tuple[NDArray[Any], ...]:
     """Return row i and column j of each point's cell, the coordinates s (across) and t (down) in it, and a twist.
 
     The twist replaces the product s t of bilinear interpolation. It is linear in each triangle of a small quad.
@@ -80,6 +83,8 @@ def _cell_coordinates(coordinates: Array, points: tuple[int, int], refine: int) 
     (rows, cols), quads = points, refine + 1
     s, t = (coordinates * (cols - 1, rows - 1)).T
     j, i = np.minimum(s.astype(int), cols - 2), np.minimum(t.astype(int), rows - 2)
+    if mask is not None:
+        i, j = mask.nearest_cells(i, j, coordinates)
     s, t = s - j, t - i
     s0, t0 = (np.minimum((each * quads).astype(int), quads - 1) / quads for each in (s, t))
     s1, t1 = s - s0, t - t0
@@ -87,7 +92,7 @@ def _cell_coordinates(coordinates: Array, points: tuple[int, int], refine: int) 
 
 
 class Surface(NamedTuple):
-    """Textured triangles, with vertices row by row from the top left."""
+    """Textured triangles, with vertices row by row from the top left; a mask leaves those of its cells."""
 
     vertices: NDArray[np.floating]  # positions [m], shape (vertices, 3)
     triangles: NDArray[np.int32]  # indices of vertices, shape (triangles, 3), counter-clockwise from above
@@ -104,23 +109,28 @@ class Solid(NamedTuple):
     shape: Shape
 
 
-def refine_surface(position: NDArray[np.floating], refine: int) -> Surface:
+def refine_surface(position: NDArray[np.floating], refine: int, mask: Mask | None = None) -> Surface:
     """Return the triangles of the sheet after bilinear refinement (section 2 of the paper).
 
-    Every small quad is divided by the diagonal from top left to bottom right.
+    Every small quad is divided by the diagonal from top left to bottom right. `mask` has the cells that are sheet, by
+    default all.
     """
     vertices = _insert(_insert(position, refine, 0), refine, 1)
     rows, cols = vertices.shape[:2]
-    corner = np.arange(rows * cols, dtype=np.int32).reshape(rows, cols)
+    quads, points = np.ones((rows - 1, cols - 1), bool), np.ones((rows, cols), bool)
+    if mask is not None:
+        quads = mask.cells.repeat(refine + 1, axis=0).repeat(refine + 1, axis=1)
+        points = Mask(quads).points
+    corner = np.cumsum(points, dtype=np.int32).reshape(rows, cols) - 1
     upper_left, upper_right = corner[:-1, :-1], corner[:-1, 1:]
     lower_left, lower_right = corner[1:, :-1], corner[1:, 1:]
     lower = np.stack([upper_left, lower_left, lower_right], axis=-1)
     upper = np.stack([upper_left, lower_right, upper_right], axis=-1)
     across, down = np.meshgrid(np.linspace(0, 1, cols), np.linspace(0, 1, rows))
     return Surface(
-        vertices.reshape(-1, 3),
-        np.stack([lower, upper], axis=2).reshape(-1, 3),
-        np.stack([across, down], axis=-1).reshape(-1, 2),
+        vertices[points],
+        np.stack([lower, upper], axis=2)[quads].reshape(-1, 3),
+        np.stack([across, down], axis=-1)[points],
     )
 
 

@@ -23,6 +23,7 @@ from typing_extensions import TypedDict
 
 from taichi_msm.arithmetic import Array
 from taichi_msm.model.geometry import CurvedRest
+from taichi_msm.model.mask import Mask
 from taichi_msm.model.rest import rest_of
 from taichi_msm.scene.scene import Scene
 from taichi_msm.scene.sheet import Sheet
@@ -112,13 +113,16 @@ def sum_probe_forces(probe: Probe, sheet: Sheet, refinement: int = 1) -> tuple[f
         fine = rest_of(sheet.model_copy(update={"points": points}))
         assert isinstance(fine, CurvedRest)
         decay, areas = law.decay(fine.distances(at)), fine.areas / rest.cell_area
-        forces = decay * areas if law.by_area else decay / refinement**2
-        return force * float(forces.sum()), force * float((forces / fine.areas).max())
+        forces, is_sheet = decay * areas if law.by_area else decay / refinement**2, areas > 0
+        return force * float(forces.sum()), force * float((forces[is_sheet] / fine.areas[is_sheet]).max())
     at_x, at_y = at
     (rows, cols), (height, width) = ((count - 1) * refinement for count in sheet.points), sheet.size
     x, y = (np.arange(cols + 1) / cols - 0.5) * width, (0.5 - np.arange(rows + 1) / rows) * height
     along, down = np.ones(cols + 1), np.ones(rows + 1)
     along[[0, -1]], down[[0, -1]] = 0.5, 0.5
+    cells = None
+    if sheet.mask is not None:
+        cells = Mask.at_cells(sheet.mask.pixels.is_sheet, (rows + 1, cols + 1)).cell_counts
     total, largest = 0.0, 0.0
     # Blocks of rows limit the memory to about a million mass points.
     block = max(1, (1 << 20) // (cols + 1))
@@ -126,6 +130,9 @@ def sum_probe_forces(probe: Probe, sheet: Sheet, refinement: int = 1) -> tuple[f
         rows_of_block = slice(first, first + block)
         decay = law.decay(np.hypot(x - at_x, y[rows_of_block, None] - at_y))
         area_share = down[rows_of_block, None] * along
+        if cells is not None:  # a sheet of tissue
+            area_share = cells[rows_of_block] / 4
+            decay = np.where(area_share > 0, decay, 0)
         total += float((decay * area_share if law.by_area else decay).sum())
         largest = max(largest, float((decay if law.by_area else decay / area_share).max()))
     return force * total / refinement**2, force * largest / rest.cell_area

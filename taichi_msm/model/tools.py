@@ -15,6 +15,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
+from heapq import heappop, heappush
 from itertools import combinations
 
 import numpy as np
@@ -22,7 +23,7 @@ from numpy.typing import NDArray
 
 from taichi_msm.arithmetic import NUMPY, Array
 from taichi_msm.errors import Problem
-from taichi_msm.model.geometry import CurvedRest, Rest
+from taichi_msm.model.geometry import Rest
 from taichi_msm.model.rest import rest_of
 from taichi_msm.model.sheet import SIDES, fixed_points, fixed_sides, rest_positions
 from taichi_msm.model.time_grid import TimeGrid
@@ -46,6 +47,9 @@ MAX_POINTS_RATIO = 4
 
 # Largest number of points between mass points at which a tool may meet a curved sheet at rest.
 MAX_POINTS_BETWEEN = 2_000_000
+
+# Distance from a block of cells, in radii of the tool, from which it counts as the distance from the sheet.
+CLEARANCE_RADII = 0.01
 
 # A grip holds the mass points within this distance of the tip's centre, in radii of the tip.
 GRIP_RADII = 1.5
@@ -172,14 +176,47 @@ class SolidTool(Tool):
     def gap_at(self, centre: Array, sheet: Sheet, points: Array | None = None) -> float:
         """Return the distance from the sheet at rest [m] with the tip's centre c [m], shape (3,); below 0 inside it.
 
-        On a curved sheet it is that from points [m], shape (n, 3), by default its mass points.
+        On a curved sheet it is that from points [m], shape (n, 3), by default its mass points. On a flat sheet with a
+        mask it may be too small where the tool is clear of the sheet.
         """
-        if sheet.surface:
-            r = (rest_of(sheet).hull if points is None else points) - centre
-            depth, *_ = self.shape.build_depth(NUMPY)(*r.T, *self.axis, self.length, self.radius)
-            return -float(depth.max())
+        rest = rest_of(sheet)
+        if not rest.is_flat:
+            return self._gap_from(rest.hull if points is None else points, centre)
+        if rest.mask is not None:
+            return self._gap_from_cells(rest.mask.cells, rest.position, centre)
         half = np.array([sheet.size[1] / 2, sheet.size[0] / 2, 0.0])
         return self.shape.gap(centre, self.axis, self.length, self.radius, half)
+
+    def _gap_from(self, points: Array, centre: Array) -> float:
+        """Return the distance from points [m], shape (n, 3)."""
+        depth, *_ = self.shape.build_depth(NUMPY)(*(points - centre).T, *self.axis, self.length, self.radius)
+        return -float(depth.max())
+
+    def _gap_from_cells(self, cells: NDArray[np.bool_], position: Array, centre: Array) -> float:
+        """Return the distance from the cells of a flat sheet [m], by dividing the nearest block of cells in two.
+
+        The distance from a block is a lower bound of that from its cells, and returned if the tool is clear of it.
+        """
+        blocks: list[tuple[float, tuple[int, ...]]] = []
+
+        def add(top: int, bottom: int, left: int, right: int) -> None:
+            present = cells[top:bottom, left:right]
+            if present.any():
+                rows, cols = (np.flatnonzero(present.any(axis=axis)).tolist() for axis in (1, 0))
+                block = top + rows[0], top + rows[-1] + 1, left + cols[0], left + cols[-1] + 1
+                first, last = position[block[0], block[2]], position[block[1], block[3]]
+                tip, half = centre - (first + last) / 2, np.abs(last - first) / 2
+                heappush(blocks, (self.shape.gap(tip, self.axis, self.length, self.radius, half), block))
+
+        add(0, cells.shape[0], 0, cells.shape[1])
+        while True:
+            gap, (top, bottom, left, right) = heappop(blocks)
+            if gap > CLEARANCE_RADII * self.radius or cells[top:bottom, left:right].all():
+                return gap
+            row, col = (top + bottom) // 2, (left + right) // 2
+            is_tall = bottom - top > right - left
+            add(top, row if is_tall else bottom, left, right if is_tall else col)
+            add(row if is_tall else top, bottom, left if is_tall else col, right)
 
     def keys_at(self, centres: Array, sheet: Sheet) -> Array:
         """Return across, down and height [m] of keyframes for centres c of the tip [m], shape (n, 3) each."""
@@ -190,13 +227,15 @@ class SolidTool(Tool):
         """Return whether the tool meets the sheet at rest at any frame or keyframe."""
         times = np.array([*np.linspace(0, scene.time.duration, scene.time.frames + 1), *self.times])
         centres, points = self.path_at(times[times <= scene.time.duration]), self.points_between(scene.sheet)
-        return any(self.gap_at(centre, scene.sheet, points) < 0 for centre in centres)
+        if points is None:
+            return any(self.gap_at(centre, scene.sheet) < 0 for centre in centres)
+        return any(self._gap_from(points, centre) < 0 for centre in centres)
 
     def points_between(self, sheet: Sheet, radii: float = 0.5) -> Array | None:
-        """Return points of a curved sheet, some radii or a tenth of a cell apart; None for a flat one."""
+        """Return points of a sheet, some radii or a tenth of a cell apart; None for a flat one without a mask."""
         rest = rest_of(sheet)
         most = min(9, math.isqrt(MAX_POINTS_BETWEEN // math.prod(sheet.points)) - 1)
-        if not isinstance(rest, CurvedRest):
+        if rest.is_flat and rest.mask is None:
             return None
         return rest.refined(max(0, min(most, int(rest.longest_side / (radii * self.radius)))))
 
@@ -325,6 +364,8 @@ class Clamp(Tool):
         key, begin = ("probes", self.probe), [float(self.times[0]), *self.path[0].tolist()]
         if self.side in fixed_sides(scene.sheet):
             yield Problem((*key, "clamp"), f"{self.side} is in sheet.fixed; remove it there, or clamp another side")
+        elif (mask := rest_of(scene.sheet).mask) and not mask.points[SIDES[self.side]].any():
+            yield Problem((*key, "clamp"), f"{self.side} has no sheet; clamp another side, or draw it in sheet.mask")
         elif not self.points.any():
             text = f"every mass point of {self.side} is fixed or held by an earlier clamp; remove one of them"
             yield Problem((*key, "clamp"), text)

@@ -261,7 +261,7 @@ def pinhole(scene: Scene, time: float = 0.0) -> Camera:
     if camera != "top":
         return PRESET_CAMERAS[camera](scene)
     distance = scene.render.size[1] / 2 / _top_scale(scene) / math.tan(math.radians(OBLIQUE_FOV) / 2)
-    lower, upper = rest_of(scene.sheet).box.tolist()
+    lower, upper = rest_of(scene.sheet).unmasked_box.tolist()
     x, y = ((a + b) / 2 for a, b in zip(lower[:2], upper[:2], strict=True))
     return Camera(eye=(x, y, upper[2] + distance), target=(x, y, float(_middle(scene)[2])), fov=OBLIQUE_FOV)
 
@@ -307,8 +307,9 @@ def _rotation(axis: Array, angle: float) -> Array:
 
 
 def _top_scale(scene: Scene) -> float:
-    """Return the scale at which the sheet at rest fits the picture [px/m]."""
-    (width, height, _), (width_px, height_px) = np.ptp(rest_of(scene.sheet).box, axis=0).tolist(), scene.render.size
+    """Return the scale at which the sheet at rest fits the picture [px/m]; a mask does not change it."""
+    box, (width_px, height_px) = rest_of(scene.sheet).unmasked_box, scene.render.size
+    width, height, _ = np.ptp(box, axis=0).tolist()
     return min(width_px / max(width, 1e-300), height_px / max(height, 1e-300))
 
 
@@ -317,7 +318,7 @@ def _top(scene: Scene) -> View:
 
     The height of the eye (depth 0) above the highest point is the larger side of the sheet, along x and y.
     """
-    (width_px, height_px), scale, box = scene.render.size, _top_scale(scene), rest_of(scene.sheet).box
+    (width_px, height_px), scale, box = scene.render.size, _top_scale(scene), rest_of(scene.sheet).unmasked_box
     (x, y, _), distance = (box[0] + box[1]) / 2, float(np.ptp(box[:, :2], axis=0).max())
     eye = np.array([x, y, box[1, 2] + distance])
     rows = [[scale, 0, 0, width_px / 2 - scale * x], [0, -scale, 0, height_px / 2 + scale * y]]
@@ -350,11 +351,11 @@ def _near(scene: Scene) -> float:
 def _fit(scene: Scene) -> Camera:
     """Return the preset fit: the sheet at rest fills the picture, except for a margin of 2 %.
 
-    On a flat sheet, in the camera's axes up and forward, from the sheet's centre, the upper edge is at (a, b) and the
-    lower edge at (-a, -b). From an eye at (-a b / d, -d) they have the tangents a / d and -a / d, so the sheet is
-    centred. The lower edge is the nearer one: half its width has the tangent width / 2 / (d - b).
+    On a rectangle, in the camera's axes up and forward, from its centre, the upper edge is at (a, b) and the lower edge
+    at (-a, -b). From an eye at (-a b / d, -d) they have the tangents a / d and -a / d, so the sheet is centred. The
+    lower edge is the nearer one: half its width has the tangent width / 2 / (d - b).
     """
-    if scene.sheet.surface:
+    if scene.sheet.surface or scene.sheet.mask:
         return _fit_points(scene)
     (height, width), (width_px, height_px), axes = scene.sheet.size, scene.render.size, OBLIQUE_AXES
     a, b = height / 2 * axes[1, 1], -height / 2 * axes[2, 1]
@@ -366,14 +367,14 @@ def _fit(scene: Scene) -> Camera:
 
 
 def _fit_points(scene: Scene) -> Camera:
-    """Return the preset fit of a curved sheet.
+    """Return the preset fit of a curved or masked sheet.
 
     An eye at (x, y, z) in the camera's axes sees all points X within the tangents -t to t if |X - x| <= t (z - Z): on
     each side the largest t Z + X bounds t z + x, and likewise the lower bound. The nearest eye meets both bounds of the
     tighter direction, and is centred in the other one.
     """
     rest, (width_px, height_px), axes = rest_of(scene.sheet), scene.render.size, OBLIQUE_AXES
-    points = rest.position.reshape(-1, 3) @ axes.T
+    points = rest.present_positions @ axes.T
     half_height = (1 - 2 * 0.02) * math.tan(math.radians(OBLIQUE_FOV) / 2)
     tangents = half_height * np.array([width_px / height_px, 1.0])
     right, left = (tangents * points[:, 2:] + sign * points[:, :2] for sign in (1, -1))

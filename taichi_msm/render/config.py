@@ -59,6 +59,7 @@ class DrawingConfig(NamedTuple):
     """Compile-time configuration of kernel 2; everything else is passed as an argument."""
 
     refined: bool  # whether cells are subdivided
+    masked: bool  # whether cells are missing
     supersample: int  # samples per pixel along each axis
     headlit: bool  # whether the sheet is lit by a headlight
     tissue: bool  # whether the sheet is shaded as wet tissue
@@ -202,6 +203,13 @@ def read_arguments(
             tiles_across,
         )
     )  # fmt: skip
+
+
+@ti.func
+def is_present(cell, sizes: ti.template()):
+    """Return whether a cell of a masked sheet is sheet."""
+    word = sizes[uni.LEVELS + uni.LEVEL_STRIDE * sizes[uni.LEVEL_COUNT] + cell // 32]
+    return ((word >> (cell % 32)) & 1) == 1
 
 
 @ti.func

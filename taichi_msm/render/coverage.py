@@ -24,6 +24,7 @@ from taichi_msm.render.config import (
     clip,
     cross,
     dot,
+    is_present,
     map_steps,
     sample_centres,
     store_visible,
@@ -296,6 +297,25 @@ def _cell_at(i, j, normal_entry, patch: ti.template(), band: ti.template()):
 
 
 @ti.func
+def _neighbours(i, j, band: ti.template()):
+    """Return the rows and columns of the neighbours of a mass point, its own where no cell lies between."""
+    i0, i1 = ti.max(i - 1, 0), ti.min(i + 1, band.rows - 1)
+    j0, j1 = ti.max(j - 1, 0), ti.min(j + 1, band.cols - 1)
+    if ti.static(band.config.masked):
+        # At the rectangle's edge, the cell on the other side stands for the missing one.
+        cols = band.cols - 1
+        above, below = ti.max(i - 1, 0) * cols, ti.min(i, band.rows - 2) * cols
+        left, right = ti.max(j - 1, 0), ti.min(j, cols - 1)
+        upper_left, upper_right = is_present(above + left, band.sizes), is_present(above + right, band.sizes)
+        lower_left, lower_right = is_present(below + left, band.sizes), is_present(below + right, band.sizes)
+        i0 = ti.select(upper_left or upper_right, i0, i)
+        i1 = ti.select(lower_left or lower_right, i1, i)
+        j0 = ti.select(upper_left or lower_left, j0, j)
+        j1 = ti.select(upper_right or lower_right, j1, j)
+    return i0, i1, j0, j1
+
+
+@ti.func
 def store_point(position: ti.template(), i, j, band: ti.template()):
     """Store the projection of a mass point; as configured, also its distorted position and its normal.
 
@@ -310,8 +330,7 @@ def store_point(position: ti.template(), i, j, band: ti.template()):
         band.nodes[distorted_entry], band.nodes[distorted_entry + 1] = x, y
         band.nodes[distorted_entry + 2] = ti.cast(is_valid and band.nodes[entry + 2] > band.near, ti.f32)
     if ti.static(config.headlit or config.tissue):
-        i0, i1 = ti.max(i - 1, 0), ti.min(i + 1, band.rows - 1)
-        j0, j1 = ti.max(j - 1, 0), ti.min(j + 1, band.cols - 1)
+        i0, i1, j0, j1 = _neighbours(i, j, band)
         right = [position[i, j1, n] - position[i, j0, n] for n in ti.static(range(3))]
         up = [position[i0, j, n] - position[i1, j, n] for n in ti.static(range(3))]
         area = cross(right, up)

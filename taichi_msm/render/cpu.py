@@ -12,7 +12,16 @@ from numpy.typing import NDArray
 
 from taichi_msm.render import geometry
 from taichi_msm.render import uniforms as uni
-from taichi_msm.render.config import INFINITY, Bytes, DrawingConfig, Floats, Integers, clear_tile, read_arguments
+from taichi_msm.render.config import (
+    INFINITY,
+    Bytes,
+    DrawingConfig,
+    Floats,
+    Integers,
+    clear_tile,
+    is_present,
+    read_arguments,
+)
 from taichi_msm.render.coverage import cover_cell, cover_instruments, store_point
 from taichi_msm.render.labels import values_per_pixel
 from taichi_msm.render.shading import resolve
@@ -145,9 +154,11 @@ def _cover_band(band: ti.template()):
         if first_row < bottom and last_row > top:
             for j in range(cols - 1):
                 overlaps = True
+                if ti.static(config.masked):
+                    overlaps = is_present(i * (cols - 1) + j, band.sizes)
                 corner, _, distorted_entry = geometry.point_entries(i * cols + j, band)
                 if ti.static(config.has_distortion):
-                    overlaps = geometry.may_cover_rows(
+                    overlaps = overlaps and geometry.may_cover_rows(
                         corner, distorted_entry, cols, band.top, band.bottom, band.uniforms, nodes
                     )
                 if overlaps:

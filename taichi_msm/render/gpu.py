@@ -15,7 +15,16 @@ from numpy.typing import NDArray
 from taichi_msm.render import geometry
 from taichi_msm.render import uniforms as uni
 from taichi_msm.render.bins import BOUNDS_STRIDE, SEARCH_ROUNDS, build_bins, is_in_bounds, owner_of, store_bounds
-from taichi_msm.render.config import INFINITY, Bytes, DrawingConfig, Floats, Integers, clear_tile, read_arguments
+from taichi_msm.render.config import (
+    INFINITY,
+    Bytes,
+    DrawingConfig,
+    Floats,
+    Integers,
+    clear_tile,
+    is_present,
+    read_arguments,
+)
 from taichi_msm.render.coverage import cover_cell, cover_instruments, store_point
 from taichi_msm.render.labels import values_per_pixel
 from taichi_msm.render.shading import resolve
@@ -71,7 +80,7 @@ class Threads:
             self._project(position, *view_arrays, self._nodes, self._pieces)
         pieces = launches.download(self._pieces)
         pieces_per_part = max(1, min(-(-int(pieces.sum(dtype=np.int64)) // MAX_PARTS), int(pieces.max())))
-        # A cell behind the eye is one empty part.
+        # A cell behind the eye or without sheet is one empty part.
         ends = np.cumsum(np.maximum(-(-pieces // pieces_per_part), 1), dtype=np.int32)
         parts = int(ends[-1])
         owners, bounds = launches.array(np.int32, 2 * parts), launches.array(np.int32, BOUNDS_STRIDE * parts)
@@ -120,7 +129,7 @@ def _sheet_kernels(config: DrawingConfig) -> tuple[Callable[..., None], Callable
     ):  # fmt: skip
         """Project the mass points, and count the pieces of each cell.
 
-        A cell has one piece if it is invertible, one per triangle if not, and none behind the eye.
+        A cell has one piece if it is invertible, one per triangle if not, and none behind the eye or without sheet.
         """
         for index in range(sizes[uni.ROWS] * sizes[uni.COLS]):
             picture = ti.static(read_arguments(uniforms, sizes, nodes, (), config))
@@ -130,8 +139,11 @@ def _sheet_kernels(config: DrawingConfig) -> tuple[Callable[..., None], Callable
             cols, subdivisions = sizes[uni.COLS], ti.cast(uniforms[uni.SUBDIVISIONS], ti.i32)
             corner = geometry.corner_entry(cell, cols)
             outline = ti.static(geometry.cell_outline(corner, cols, uniforms[uni.NEAR], nodes))
+            missing = outline.behind
+            if ti.static(config.masked):
+                missing = missing or not is_present(cell, sizes)
             pieces[cell] = ti.select(
-                outline.behind, 0, ti.select(geometry.is_invertible(outline), 1, 2 * subdivisions * subdivisions)
+                missing, 0, ti.select(geometry.is_invertible(outline), 1, 2 * subdivisions * subdivisions)
             )
 
     @ti.kernel

@@ -9,6 +9,8 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from taichi_msm.model.mask import Mask
+
 # Unknown flow in the Middlebury format.
 NO_FLOW = 1e10
 
@@ -133,8 +135,9 @@ class Sight(NamedTuple):
     """Pixels and occlusion of material points.
 
     Attributes:
-        pixels: x to the right and y down from the picture's upper left corner [px], shape (n, 2); NaN behind the eye.
-        hidden: whether a point is occluded or outside the picture, shape (n,).
+        pixels: x to the right and y down from the picture's upper left corner [px], shape (n, 2); NaN behind the eye,
+            and for points in cells without sheet.
+        hidden: whether a point is occluded, outside the picture or without sheet, shape (n,).
     """
 
     pixels: NDArray[np.float32]
@@ -151,8 +154,12 @@ class FrameOutputs(NamedTuple):
     tracks: Sight | None = None
 
 
-def track_grid(count: int) -> NDArray[np.float32]:
-    """Return the coordinates of the centres of count^2 equal cells of the sheet, row by row, shape (count^2, 2)."""
+def track_grid(count: int, mask: Mask | None = None) -> NDArray[np.float32]:
+    """Return the coordinates of the centres of count^2 equal parts of the rectangle, row by row, shape (n, 2).
+
+    Of a masked sheet, those on it.
+    """
     centres = (np.arange(count) + 0.5) / count
     down, across = np.meshgrid(centres, centres, indexing="ij")
-    return np.stack([across, down], axis=-1).reshape(-1, 2).astype(np.float32)
+    coordinates = np.stack([across, down], axis=-1).reshape(-1, 2)
+    return (coordinates if mask is None else coordinates[mask.covers(coordinates)]).astype(np.float32)

@@ -13,6 +13,7 @@ from taichi_msm.model.rest import rest_of
 from taichi_msm.model.tool_force import control_points
 from taichi_msm.render import texture
 from taichi_msm.render.camera import is_moving, view_at
+from taichi_msm.render.labels import track_grid
 from taichi_msm.scene.camera import Camera, Distortion
 from taichi_msm.scene.render import Light
 from taichi_msm.scene.scene import Scene
@@ -32,6 +33,10 @@ def drawing_warnings(scene: Scene) -> Iterator[str]:
             yield f"render.light has no effect with shading: {scene.render.shading}; take render.shading: tissue"
     if scene.renders:
         yield from _invisible_sheet(scene)
+    if scene.asks_for("tracks"):
+        count, tracks = scene.render.tracks**2, len(track_grid(scene.render.tracks, rest_of(scene.sheet).mask))
+        if tracks < count:
+            yield f"render.tracks: {count - tracks} of {count} tracks are left out, as they fall on no sheet"
     for index, probe in enumerate(scene.probes):
         if (instrument := probe.instrument) is None:
             continue
@@ -118,7 +123,11 @@ def _is_visible(camera: View, pixels: NDArray[np.float64], scene: Scene) -> bool
     height, width = scene.sheet.size
     # Pixels without a line of sight are NaN, and compare false.
     is_inside = (inverse_w > 0) & (np.abs(x) <= width / 2 * inverse_w) & (np.abs(y) <= height / 2 * inverse_w)
-    return bool((is_inside & (inverse_w * camera.near < 1)).any())
+    is_inside &= inverse_w * camera.near < 1
+    if (mask := rest_of(scene.sheet).mask) is not None:
+        at = np.stack([x, y], axis=-1)[is_inside] / inverse_w[is_inside, None]
+        return bool(mask.covers(rest_of(scene.sheet).fractions(at)).any())
+    return bool(is_inside.any())
 
 
 def _stretched_picture(scene: Scene) -> Iterator[str]:

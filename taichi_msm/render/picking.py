@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 from taichi_msm.arithmetic import Array
 from taichi_msm.cameras.view import View
 from taichi_msm.model.crossings import cells_on_line
+from taichi_msm.model.mask import Mask
 from taichi_msm.model.rest import rest_of
 from taichi_msm.scene.sheet import Sheet
 
@@ -17,11 +18,11 @@ CELLS_PER_BATCH = 1024
 Pair = tuple[float, float]
 
 
-def pick(position: NDArray[np.floating], refine: int, view: View, pixel: Pair) -> Pair | None:
+def pick(position: NDArray[np.floating], refine: int, view: View, pixel: Pair, mask: Mask | None = None) -> Pair | None:
     """Return the material point at the centre of a pixel, on the nearest triangle there; None without a surface.
 
     It is in fractions of the sheet's width from its left and of its height from its top. `position` are the positions
-    of the mass points [m], shape (rows, cols, 3).
+    of the mass points [m], shape (rows, cols, 3); `mask` has the cells that are sheet, by default all.
 
     A point (X, Y, w, depth) projects to (x, y) if a = X - x w and b = Y - y w are 0. Both are linear, and need no
     division by w, which is 0 or negative behind the camera.
@@ -29,7 +30,8 @@ def pick(position: NDArray[np.floating], refine: int, view: View, pixel: Pair) -
     rows, cols = position.shape[:2]
     ray = view.centred_at(pixel)
     hits: list[tuple[float, Pair]] = []
-    cells = np.argwhere(cells_on_line(position @ row[:3] + row[3] for row in ray.matrix[:2]))
+    on_line = cells_on_line(position @ row[:3] + row[3] for row in ray.matrix[:2])
+    cells = np.argwhere(on_line if mask is None else on_line & mask.cells)
     for first in range(0, len(cells), CELLS_PER_BATCH):
         i, j = cells[first : first + CELLS_PER_BATCH].T
         corners = np.stack([position[i + below, j + right] for below in (0, 1) for right in (0, 1)], axis=1)
@@ -43,7 +45,7 @@ def pick(position: NDArray[np.floating], refine: int, view: View, pixel: Pair) -
 def pick_at_rest(sheet: Sheet, refine: int, view: View, pixel: Pair) -> Pair | None:
     """Return the place (across, down) of the sheet at rest that a pixel shows; None without one.
 
-    The plane of a flat sheet continues beyond its edges.
+    The plane of a flat sheet continues beyond its edges, and every sheet in cells without sheet.
     """
     rest = rest_of(sheet)
     if not rest.is_flat:

@@ -39,6 +39,7 @@ def drawing_config(
     tissue = picture and render.shading == "tissue"
     return DrawingConfig(
         refined=render.refine > 0,
+        masked=scene.sheet.mask is not None,
         supersample=render.supersample if picture else 1,
         headlit=picture and render.shading == "headlight",
         tissue=tissue,

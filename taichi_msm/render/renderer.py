@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from taichi_msm.cameras.view import View
 from taichi_msm.errors import ArgumentError, as_array, did_you_mean, is_real_array
+from taichi_msm.model.rest import rest_of
 from taichi_msm.render.camera import Shot, is_moving, view, view_at
 from taichi_msm.render.labels import LABELS, Flow, FrameOutputs, Labels, Sight, Stereo, requested_labels, track_grid
 from taichi_msm.render.texture import load_texture
@@ -136,7 +137,8 @@ class Renderer:
         if before is not None and scene.asks_for("flow"):
             observed = observed._replace(flow=self.flow(before, shot))
         if scene.asks_for("tracks"):
-            observed = observed._replace(tracks=self.locate(track_grid(scene.render.tracks), shot))
+            grid = track_grid(scene.render.tracks, rest_of(scene.sheet).mask)
+            observed = observed._replace(tracks=self.locate(grid, shot))
         return observed
 
     def close(self) -> None:

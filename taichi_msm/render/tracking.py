@@ -12,11 +12,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from taichi_msm.model.rest import rest_of
 from taichi_msm.render import geometry, lens_kernels
 from taichi_msm.render import uniforms as uni
 from taichi_msm.render.bins import BOUNDS_STRIDE, build_bins, store_bounds
 from taichi_msm.render.camera import Shot
-from taichi_msm.render.config import INFINITY, Bytes, Doubles, Floats, Integers
+from taichi_msm.render.config import INFINITY, Bytes, Doubles, Floats, Integers, is_present
 from taichi_msm.render.coverage import intersect_instrument
 from taichi_msm.render.geometry import NODE_STRIDE
 from taichi_msm.render.labels import NO_FLOW, Flow, Labels, Sight
@@ -36,6 +37,9 @@ UNBOUNDED = 1e9
 
 CELLS_AROUND_POINT = 4
 
+# Accuracy of coordinates of labels [sides of a cell].
+COORDINATE_TOLERANCE = 1e-4
+
 # Pixel coordinate of points without a projection.
 NOT_VISIBLE = math.nan
 
@@ -43,6 +47,9 @@ NOT_VISIBLE = math.nan
 def locate_points(scene: Scene, coordinates: Array, shot: Shot) -> Sight:
     """Project material points, with coordinates as in `Labels`, shape (n, 2), and determine their occlusion."""
     pixels, hidden = _track(scene, coordinates, shot)
+    if (mask := rest_of(scene.sheet).mask) is not None:
+        is_missing = ~mask.covers(coordinates, COORDINATE_TOLERANCE)
+        pixels[is_missing], hidden[is_missing] = NOT_VISIBLE, True
     return Sight(pixels, hidden.view(np.bool_))
 
 
@@ -116,7 +123,8 @@ def _track(
     bounds = launches.array(np.int32, cells * BOUNDS_STRIDE)
     position = np.ascontiguousarray(shot.positions, np.float64)
     with compilation_options(optimised=False):
-        _outline_cells(position, uniforms, launches.upload(sizes), nodes, outlines, bounds)
+        masked = scene.sheet.mask is not None
+        _outline_cells(position, uniforms, launches.upload(sizes), nodes, outlines, bounds, masked)
     bins = build_bins(launches, bounds, cells, (width, height), bin_size)
     sizes[[uni.BIN_SIZE, uni.BINS_ACROSS, uni.WIDTH, uni.HEIGHT]] = bins.size, bins.columns, *scene.render.size
     is_simple = launches.array(np.uint8, bins.lengths.size)
@@ -142,7 +150,7 @@ def _track(
 @ti.kernel
 def _outline_cells(
     position: ti.types.ndarray(dtype=ti.f64, ndim=3), uniforms: Doubles, sizes: Integers, nodes: Doubles,
-    outlines: Doubles, bounds: Integers,
+    outlines: Doubles, bounds: Integers, masked: ti.template(),
 ):  # fmt: skip
     """Project the mass points, and compute the outlines of the cells and their bounds in whole pixels."""
     for index in range(sizes[uni.ROWS] * sizes[uni.COLS]):
@@ -163,6 +171,9 @@ def _outline_cells(
             width, height = ti.cast(sizes[uni.WIDTH], ti.f64), ti.cast(sizes[uni.HEIGHT], ti.f64)
             if geometry.is_off_screen(projected, 0.0, width, 0.0, height):
                 left, right = 1.0, -1.0
+        if ti.static(masked):  # noqa: SIM102  (evaluated at compile time)
+            if not is_present(index, sizes):
+                left, right, top, bottom = 1.0, -1.0, 1.0, -1.0
         outlines[entry + CELL_MIN_X], outlines[entry + CELL_MAX_X] = left, right
         outlines[entry + CELL_MIN_Y], outlines[entry + CELL_MAX_Y] = top, bottom
         outlines[entry + CELL_MIN_DEPTH] = ti.min(projected[0][3], projected[1][3], projected[2][3], projected[3][3])

@@ -46,7 +46,8 @@ METAL_AMBIENT, METAL_DIFFUSE, METAL_MIRROR, METAL_GLOSS = 0.2, 0.35, 0.6, 0.7
 METAL_NEAREST = 0.2
 
 # Indices into the array of sizes: sizes of the sheet, the picture and its bins; counters of the workers, for rows
-# taken, rows projected and bands taken; levels of the texture, each with its first texel, width and height.
+# taken, rows projected and bands taken; levels of the texture, each with its first texel, width and height; then, of a
+# masked sheet, a bit per cell, row by row, 1 where there is sheet.
 ROWS, COLS, WIDTH, HEIGHT, INSTRUMENT_COUNT, BIN_SIZE, BINS_ACROSS = range(7)
 ROWS_TAKEN, ROWS_PROJECTED, BANDS_TAKEN, LEVEL_COUNT, LEVELS = range(7, 12)
 LEVEL_STRIDE = 3
@@ -84,9 +85,11 @@ KINDS = {name: float(number) for number, name in enumerate(SHAPES)}
 
 def sizes_of(scene: Scene, levels: NDArray[np.int32]) -> NDArray[np.int32]:
     """Return the array of sizes and counters of a scene, 0 where they vary by frame; `levels` as from `pyramid`."""
-    sizes = np.zeros(LEVELS + levels.size, np.int32)
+    mask = rest_of(scene.sheet).mask
+    bits = np.empty(0, np.uint8) if mask is None else np.packbits(mask.cells, bitorder="little")
+    words = np.pad(bits, (0, -bits.size % 4)).view("<i4")
+    sizes = np.concatenate([np.zeros(LEVELS, np.int32), levels.ravel(), words], dtype=np.int32)
     sizes[[ROWS, COLS, WIDTH, HEIGHT, LEVEL_COUNT]] = *scene.sheet.points, *scene.render.size, len(levels)
-    sizes[LEVELS:] = levels.flat
     return sizes
 
 

@@ -76,8 +76,7 @@ class Manifest:
     def require_same_inputs(self, sha256: Mapping[str, str], versions: Mapping[str, str]) -> None:
         """Raise a FilesError if a file or a version has changed, so that a resumed run could yield other bits."""
         for key, path in self.scene.pictures.items():
-            if sha256.get(key) != self.sha256.get(key):
-                raise FilesError(f"{path} has changed since the run began; put it back, or run the scene again")
+            _require_same_file(path, sha256.get(key), self.sha256.get(key))
         original, current = result_versions(self.versions, self.arch), result_versions(versions, self.arch)
         if original != current:
             # Without another difference, the compiler differs; it is missing in `original` if it is a tested one.
@@ -99,6 +98,11 @@ class Manifest:
 
 
 _MANIFEST_ADAPTER = TypeAdapter(Manifest)
+
+
+def _require_same_file(path: str, sha256: str | None, original: str | None) -> None:
+    if sha256 != original:
+        raise FilesError(f"{path} has changed since the run began; put it back, or run the scene again")
 
 
 def read_manifest(directory: Path) -> tuple[Manifest, Plan]:
@@ -124,9 +128,12 @@ def read_manifest(directory: Path) -> tuple[Manifest, Plan]:
             problem = "is of an earlier version of the program"
             raise FilesError(f"{path} {problem}; run the scene again, or continue with that version") from None
         raise _damaged(path) from None
+    for key, name in manifest.scene.sheet.files.items():
+        with suppress(PictureError):
+            _require_same_file(name, file_sha256(name), manifest.sha256.get(key))
     plan, problems = try_plan(manifest.scene)
     if unreadable := [
-        str(problem) for problem in problems if problem.path[-1:] == ("image",) or "surface" in problem.path
+        str(problem) for problem in problems if problem.path[-1:] == ("image",) or {"surface", "mask"} & {*problem.path}
     ]:
         raise SceneError(unreadable)
     numbers = () if manifest.estimate is None else asdict(manifest.estimate).values()

@@ -16,6 +16,8 @@ from pydantic import TypeAdapter
 
 from taichi_msm.errors import FilesError, SceneError, require_path
 from taichi_msm.images import PictureError, file_sha256, read_rgb
+from taichi_msm.model.mask import Mask
+from taichi_msm.model.rest import rest_of
 from taichi_msm.model.sheet import rest_positions
 from taichi_msm.render.camera import camera_problems
 from taichi_msm.runs.arrays import map_array
@@ -92,9 +94,10 @@ class FinishedRun:
 
     def require_same_pictures(self, *, drawn: bool) -> None:
         """Raise a FilesError unless the maps, and if `drawn` the picture, have the SHA-256 of the run."""
-        for key, path in self.scene.pictures.items():
-            if key == "image" and not drawn:
-                continue
+        self._require_same({key: path for key, path in self.scene.pictures.items() if drawn or key != "image"})
+
+    def _require_same(self, files: Mapping[str, str]) -> None:
+        for key, path in files.items():
             fault = f"{path} differs from the file of the run (SHA-256)"
             try:
                 if file_sha256(path) == self.sha256.get(key):
@@ -102,6 +105,13 @@ class FinishedRun:
             except PictureError as error:
                 fault = error.fault
             raise FilesError(f"{self.directory}: {key}: {fault}; {RESTORE_PICTURE}")
+
+    def mask(self) -> Mask | None:
+        """Return the cells that are sheet, None for all; a FilesError unless the file has the SHA-256 of the run."""
+        if self.scene.sheet.mask is None:
+            return None
+        self._require_same(self.scene.sheet.files)
+        return rest_of(self.scene.sheet).mask
 
     def has_output(self, key: str) -> bool:
         """Return whether the results contain the files of an entry of `output`."""
@@ -166,9 +176,15 @@ def read_run(directory: str | Path) -> FinishedRun:
         if not isinstance(frames, int) or not 1 <= frames <= scene.time.frames + 1 or not is_resolved:
             raise damaged_result(path)
         largest_frame = min(record.get("max_displacement_frame", frames), frames - 1)
-    return FinishedRun(
-        path.parent, record["status"], scene, frames, largest_frame, sha256, overrides, data, scene.render.main
-    )
+        run = FinishedRun(
+            path.parent, record["status"], scene, frames, largest_frame, sha256, overrides, data, scene.render.main
+        )
+        run._require_same(scene.sheet.files)  # without which there is no sheet
+        problems = [*try_plan(scene)[1], *camera_problems(scene)]
+        # Other problems are ignored: later methods check the pictures, and the step was valid with the original map.
+        if any(problem.path[-1:] != ("image",) and problem.path[0] != "time" for problem in problems):
+            raise SceneError([str(problem) for problem in problems])
+    return run
 
 
 @contextmanager
@@ -195,8 +211,4 @@ def _read_scene(record: Mapping[str, Any]) -> Scene:
     scene, folder = Scene(**record["scene"]), Path(record["working_directory"])
     if folder != Path.cwd():
         scene = scene.with_pictures(lambda path: str(folder / path))
-    problems = [*try_plan(scene)[1], *camera_problems(scene)]
-    # Other problems are ignored: later methods check the pictures, and the step was valid with the original map.
-    if any(problem.path[-1:] not in (("image",), ("file",)) and problem.path[0] != "time" for problem in problems):
-        raise SceneError([str(problem) for problem in problems])
     return scene

@@ -27,6 +27,7 @@ from taichi_msm.errors import (
 from taichi_msm.load.check import check_scene
 from taichi_msm.load.resolve import resolve
 from taichi_msm.model.plan import Plan
+from taichi_msm.model.rest import rest_of
 from taichi_msm.model.surface import Surface, place_instruments, refine_surface, to_positions
 from taichi_msm.render.camera import Shot
 from taichi_msm.render.labels import Flow, FrameOutputs, Labels, Sight
@@ -177,7 +178,7 @@ class Simulation(AbstractContextManager["Simulation"]):
 
         Raises:
             ArgumentError: when the compiled kernel does not support these probes.
-            SceneError: when an entry is not a valid probe, or a tool would jump.
+            SceneError: when an entry is not a valid probe, or a tool would jump, or falls on no sheet.
         """
         self._require_open()
         require_type(probes, Sequence, "probes", "a list of them")
@@ -299,7 +300,7 @@ class Simulation(AbstractContextManager["Simulation"]):
 
     def surface(self) -> Surface:
         """Return the refined surface as a triangle mesh with texture coordinates."""
-        return refine_surface(self.positions(), self.scene.render.refine)
+        return refine_surface(self.positions(), self.scene.render.refine, rest_of(self.scene.sheet).mask)
 
     def diagnose(self, start: Snapshot | None = None, pause: Pause = lambda: None) -> Diagnosis:
         """Find the cause of a divergence in `advance`. The simulation needs `restore` before the next `advance`.
@@ -412,7 +413,8 @@ class Simulation(AbstractContextManager["Simulation"]):
         if not (is_real_array(point, (2,)) and np.isfinite(point).all()):
             raise ArgumentError(f"pixel: {pixel!r}; take two numbers, x to the right and y down")
         x, y = point.tolist()
-        return pick(self.positions(), self.scene.render.refine, self.renderer.resolve_camera(camera, self.time), (x, y))
+        view, mask = self.renderer.resolve_camera(camera, self.time), rest_of(self.scene.sheet).mask
+        return pick(self.positions(), self.scene.render.refine, view, (x, y), mask)
 
     def observe(
         self,

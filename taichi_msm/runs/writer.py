@@ -183,10 +183,10 @@ class LabelWriter:
         self._frame_outputs = [output for output in selected if output.source in ("labels", "flow", "stereo")]
         self._writes_camera = any(OUTPUTS[name].needs_camera for names in scene.folders.values() for name in names)
         # Tracks stay in memory until `finish`, as their arrays are ordered by track, not by frame.
-        shape = scene.render.tracks**2 if scene.asks_for("tracks") else 0, scene.time.frames + 1
+        self._grid = track_grid(scene.render.tracks, rest_of(scene.sheet).mask)
+        shape = len(self._grid) if scene.asks_for("tracks") else 0, scene.time.frames + 1
         self._pixels, self._occluded = np.empty((*shape, 2), np.float32), np.empty(shape, np.bool_)
         self._position = np.empty((*shape, 3), np.float32)
-        self._grid = track_grid(scene.render.tracks)
         self._added = 0
 
     def add(self, frame: int, observed: FrameOutputs, position: NDArray[Any]) -> None:

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 from pydantic import ConfigDict, Field, ValidationError, model_validator
 from typing_extensions import Self
 
-from taichi_msm.images import PictureError, file_sha256, read_grey
+from taichi_msm.images import DECODING_BYTES, PictureError, file_sha256, picture_size, read_grey, require_memory
 from taichi_msm.laws.locking import Locking
 from taichi_msm.scene.section import (
     MAX_PATH,
@@ -70,7 +70,8 @@ class SheetMask(Section):
     @cached_property
     def pixels(self) -> MaskPixels:
         """Pixels, read once; a PictureError if the file cannot be used."""
-        sha256 = file_sha256(self.image)
+        sha256, (width, height) = file_sha256(self.image), picture_size(self.image)
+        require_memory(self.image, DECODING_BYTES * width * height, "scale it down")
         grey = read_grey(self.image, sha256)
         # White is 128 and more, of 16 bits 32768.
         return MaskPixels((grey >> (8 * grey.dtype.itemsize - 1) == 1) != self.invert, sha256)

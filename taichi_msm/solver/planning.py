@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from taichi_msm.errors import ArgumentError, Problem, SceneError
 from taichi_msm.images import PictureError
 from taichi_msm.integrators import INTEGRATORS
-from taichi_msm.model.mask_checks import mask_problems
+from taichi_msm.model.mask_checks import mask_problems, place_problems
 from taichi_msm.model.plan import Plan, build_slots
 from taichi_msm.model.rest import rest_of
 from taichi_msm.model.sheet import (
@@ -275,7 +275,8 @@ def steer_plan(plan: Plan, probes: Sequence[Probe | Mapping[str, Any] | None], n
         raise ArgumentError(f"probes: {len(probes)} given, but the scene has {len(before)}; give all of them")
     given = [_fill_omitted_keys(*pair) for pair in zip(before, probes, strict=True)]
     after = plan.with_probes(given)
-    joined, lines = list(after.scene.probes), []
+    joined, mask = list(after.scene.probes), rest_of(plan.scene.sheet).mask
+    lines = [] if mask is None else [str(problem) for problem in place_problems(after.scene, mask)]
     for index, (old, new) in enumerate(zip(before, after.scene.probes, strict=True)):
         if old.moved and new.moved and old != new:
             lines += [str(problem) for problem in _path_problems(plan, index, old, new, now)]

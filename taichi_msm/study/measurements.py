@@ -22,7 +22,8 @@ from numpy.typing import NDArray
 from pydantic import BaseModel
 
 from taichi_msm.accuracy.divergence import displacement_bound
-from taichi_msm.accuracy.mesh import MIN_POINTS_PER_SIDE, interpolate, with_points
+from taichi_msm.accuracy.interpolation import difference, interpolate
+from taichi_msm.accuracy.mesh import MIN_POINTS_PER_SIDE, with_points
 from taichi_msm.accuracy.time_step import max_norm
 from taichi_msm.errors import ProgressCallback
 from taichi_msm.integrators import INTEGRATORS
@@ -33,6 +34,7 @@ from taichi_msm.model.tools import min_steps_per_frame
 from taichi_msm.render.rasterizer import Rasterizer
 from taichi_msm.scene.scene import Scene
 from taichi_msm.scene.section import MAX_POINTS
+from taichi_msm.scene.sheet import Sheet
 from taichi_msm.solver.dynamics import Dynamics
 from taichi_msm.solver.planning import min_stable_steps, plan_variant, try_plan, with_time
 from taichi_msm.study.result import DrawingMeasurement, MeshMeasurement, Reference, SteppingMeasurement, Study
@@ -252,17 +254,19 @@ class MeshStudy:
             for sheet in sheets:
                 sheet.restart(sheet.plan.with_grid(steps_per_frame=grid.steps_per_frame))
             errors, reference_error, largest = [0.0] * len(sheets), 0.0, 0.0
+            meshes = [sheet.plan.scene.sheet for sheet in sheets]
             for _ in range(grid.frames):
                 for sheet in sheets:
                     self._tick()
                     sheet.advance(grid.steps_per_frame)
                 fields = [sheet.displacement() for sheet in sheets]
                 with np.errstate(all="ignore"):
-                    exact, bound = _reference(fields, extrapolate=not finest.tools)
-                    frame_errors = [max_norm(interpolate(field, exact) - exact) for field in fields[:-1]]
+                    exact, bound = _reference(fields, meshes, extrapolate=not (finest.tools or meshes[-1].mask))
+                    coarser = list(zip(fields[:-1], meshes[:-1], strict=True))
+                    frame_errors = [max_norm(difference(exact, field, meshes[-1], mesh)) for field, mesh in coarser]
                     # The error of the finest mesh between its points is not measured. At order 1 or more, its distance
                     # from a mesh with half the cells per side is a bound.
-                    frame_errors.append(max_norm(interpolate(fields[-2], fields[-1]) - fields[-1]))
+                    frame_errors.append(max_norm(difference(fields[-1], fields[-2], meshes[-1], meshes[-2])))
                 errors = [max(pair) for pair in zip(errors, frame_errors, strict=True)]
                 reference_error, largest = max(reference_error, bound), max(largest, max_norm(exact))
             self._done += 1
@@ -308,14 +312,14 @@ def _scaled(plan: Plan, ratio: float) -> tuple[int, int]:
     return rows, cols
 
 
-def _reference(fields: list[Array], *, extrapolate: bool) -> tuple[Array, float]:
+def _reference(fields: list[Array], meshes: list[Sheet], *, extrapolate: bool) -> tuple[Array, float]:
     """Return Richardson's extrapolation of order 2 of the two finest fields, and a bound of its error [m]."""
     # u* = u + (u - u_r) / (r^2 - 1), where the cells of u_r are r times as long. The correction is computed at the mass
     # points of u_r and interpolated at those of u. The rough bound is the distance of u* from the extrapolation of the
-    # next coarser pair, or from u without a third field. With contact, of order 1, u is the reference, and its distance
-    # from u_r the rough bound.
+    # next coarser pair, or from u without a third field. With contact or a mask, of order 1, u is the reference, and
+    # its distance from u_r the rough bound.
     if not extrapolate:
-        return fields[-1], max_norm(interpolate(fields[-1], fields[-2]) - fields[-2])
+        return fields[-1], max_norm(difference(fields[-2], fields[-1], meshes[-2], meshes[-1]))
     exact = fields[-1] + interpolate(_correction(fields[-1], fields[-2]), fields[-1])
     if len(fields) > 2:
         before = fields[-2] + interpolate(_correction(fields[-2], fields[-3]), fields[-2])

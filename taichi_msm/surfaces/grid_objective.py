@@ -6,7 +6,7 @@ E and G are the squares of the corner's two sides, across and down, A is the are
 and Am the mean area of the cells of the grid p = (u, v). The first term is 1 where all cells are rectangles of the
 aspect r, larger elsewhere, and infinite where A is 0. With e and g, the means of E / A and G / A, the best r is
 (e / g)^(1/2), and the mean of the first term (e g)^(1/2).
-"""  # noqa: D400, D415
+"""  # noqa: D415
 
 from __future__ import annotations
 

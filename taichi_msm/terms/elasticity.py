@@ -84,11 +84,11 @@ def energy_density(plan: Plan, displacement: Array) -> Array:
 
     Each end of a spring has half of its energy. The sum of density times `area_shares` times the area of a cell is
     therefore the energy of all springs, relative to the state at rest. The displacement x - X [m] has the shape (rows,
-    cols, 3).
+    cols, 3). Points without sheet have the density 0.
     """
-    by_point, cell_area = np.zeros(displacement.shape[:2]), rest_of(plan.scene.sheet).cell_area
+    by_point, areas = np.zeros(displacement.shape[:2]), rest_of(plan.scene.sheet).cell_area * plan.area_shares
     for family in spring_families(plan):
         energy = family.energy(displacement)
         by_point[family.start] += energy / 2
         by_point[family.end] += energy / 2
-    return by_point / (cell_area * plan.area_shares)
+    return by_point / np.where(areas > 0, areas, 1.0)

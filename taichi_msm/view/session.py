@@ -495,7 +495,8 @@ def _force_tool(plan: Plan, scene_probes: Sequence[Probe]) -> ForceControlledToo
     probe = next((probe for probe in plan.scene.probes if not probe.moved), None)
     if probe is None:
         return None
-    return ForceControlledTool(probe, plan.grid.frames_per_second, clear_start(probe, scene_probes, plan.scene))
+    start, mask = clear_start(probe, scene_probes, plan.scene), rest_of(plan.scene.sheet).mask
+    return ForceControlledTool(probe, plan.grid.frames_per_second, start, mask)
 
 
 def _position_tool(plan: Plan, scene_probes: Sequence[Probe]) -> PositionControlledTool | None:

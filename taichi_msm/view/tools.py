@@ -8,6 +8,9 @@ from collections.abc import Sequence
 from itertools import product
 from typing import Any
 
+import numpy as np
+
+from taichi_msm.model.mask import Mask
 from taichi_msm.model.plan import Plan
 from taichi_msm.model.rest import rest_of
 from taichi_msm.model.tool_force import control_points
@@ -35,15 +38,27 @@ STARTS: tuple[SheetPosition, ...] = (CENTRE, *product((0.1, 0.9), (0.1, 0.9)), *
 
 
 def clear_start(probe: Probe, scene_probes: Sequence[Probe], scene: Scene) -> SheetPosition:
-    """Return the first of `STARTS` at which an idle tool intersects no tool of `scene_probes`, or else the centre."""
+    """Return the first of `STARTS` on the sheet at which an idle tool intersects no tool of `scene_probes`.
+
+    Otherwise it is the first one on the sheet, or else the middle of the cell nearest to the centre.
+    """
+    mask, starts = rest_of(scene.sheet).mask, STARTS
+    if mask is not None:
+        starts = tuple(start for start in STARTS if mask.covers(np.array([start]))[0]) or (_central_cell(mask),)
     if probe.instrument is None:
-        return CENTRE
+        return starts[0]
     others = [_capsule(each, scene.sheet) for each in scene_probes if each.instrument is not None]
-    for start in STARTS:
+    for start in starts:
         hovering = Probe(path=((0.0, *start, _hover_height(probe.instrument)),), instrument=probe.instrument)
         if all(overlap((_capsule(hovering, scene.sheet), each), scene.time.duration) is None for each in others):
             return start
-    return CENTRE
+    return starts[0]
+
+
+def _central_cell(mask: Mask) -> SheetPosition:
+    middles = (np.argwhere(mask.cells)[:, ::-1] + 0.5) / mask.cells.shape[::-1]
+    across, down = middles[np.abs(middles - CENTRE).max(axis=1).argmin()].tolist()
+    return on_sheet((across, down))
 
 
 def _capsule(probe: Probe, sheet: Sheet) -> SolidTool:
@@ -75,13 +90,16 @@ class ForceControlledTool:
     """A tool that presses at one control point at a time, with the force, falloff and offset of a probe.
 
     A frame applies at most one press or release, and the others wait: the force is 0 for at least a frame before the
-    tool acts at another position. It rises within `RISE_TIME_S`, and drops to 0 at a release.
+    tool acts at another position. It rises within `RISE_TIME_S`, and drops to 0 at a release. On a sheet with a mask,
+    it stays on the sheet; only between two presses it jumps over holes.
     """
 
-    def __init__(self, probe: Probe, frame_rate: float, start: SheetPosition = CENTRE) -> None:
+    def __init__(
+        self, probe: Probe, frame_rate: float, start: SheetPosition = CENTRE, mask: Mask | None = None
+    ) -> None:
         self.strength = 100.0  # force of a press [% of the full force]
         self.probe = probe
-        self._frame_rate, self._start = frame_rate, start
+        self._frame_rate, self._start, self._mask = frame_rate, start, mask
         self.reset()
 
     def reset(self) -> None:
@@ -120,10 +138,13 @@ class ForceControlledTool:
         self._pending.append((on_sheet(position), direction))
 
     def move(self, position: SheetPosition) -> None:
-        """Move to another position, in a straight line within a frame."""
+        """Move to another position, in a straight line within a frame; stay if the line leaves the sheet."""
         position = on_sheet(position)
-        if self._pending and self._pending[-1] is not None:
-            self._pending[-1] = (position, self._pending[-1][1])
+        press = self._pending[-1] if self._pending else None
+        if self._has_gap(position if press else self.position, position):
+            return
+        if press:
+            self._pending[-1] = (position, press[1])
         else:
             self._target = position
 
@@ -150,7 +171,9 @@ class ForceControlledTool:
             self.percent = target if abs(change) <= limit else self.percent + math.copysign(limit, change)
             self._move_to_target(end)
         _append_keyframe(self._load, (end, self.percent))
-        return self._as_probe(self._load[-ACTIVE_KEYFRAMES:], self._at[-ACTIVE_KEYFRAMES:], end)
+        at = self._at[-ACTIVE_KEYFRAMES:]
+        jumps = [n for n in range(1, len(at)) if at[n][0] == at[n - 1][0]]
+        return self._as_probe(self._load[-ACTIVE_KEYFRAMES:], at[max(jumps, default=0) :], end)
 
     def recorded_probe(self, frame: int) -> Probe:
         """Return the probe with all keyframes up to a frame."""
@@ -160,7 +183,13 @@ class ForceControlledTool:
         self.position = self._target
         if self._at[-1][0] == time:
             self._at.pop()
+        if self._at and self._has_gap(self._at[-1][1:], self.position):
+            _append_keyframe(self._at, (time, *self._at[-1][1:]))
         _append_keyframe(self._at, (time, *self.position))
+
+    def _has_gap(self, start: tuple[float, ...], end: SheetPosition) -> bool:
+        """Return whether a straight line leaves the sheet."""
+        return self._mask is not None and self._mask.first_gap(np.array(start), np.array(end)) is not None
 
     def _as_probe(
         self, load: Sequence[tuple[float, float]], at: Sequence[tuple[float, float, float]], end: float

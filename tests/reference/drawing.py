@@ -8,6 +8,7 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+from PIL import Image
 
 from taichi_msm.cameras.view import View
 from taichi_msm.model.surface import Solid
@@ -121,7 +122,7 @@ def rasterise(
 
     background = (np.inf, np.nan, np.nan, 0.0, 0.0, 1.0, [np.nan] * 3)
     buffer = GBuffer(*(np.full((height, width, *np.shape(value)), value) for value in background))
-    for triangle in triangles(surface):
+    for triangle in triangles(surface, present(scene)):
         left, top, right, bottom = 0, 0, width - 1, height - 1
         if (triangle[:, 2] > camera.near).all():
             corner = triangle[:, :2] / triangle[:, 2:3]
@@ -151,9 +152,27 @@ def rasterise(
     return buffer
 
 
-def triangles(surface: Array) -> Iterator[Array]:
-    """Yield the triangles of refined vertices, shape (rows, cols, k); each triangle has the shape (3, k)."""
-    for r, c in np.ndindex(surface.shape[0] - 1, surface.shape[1] - 1):
+def present(scene: Scene) -> NDArray[np.bool_]:
+    """Return whether each cell is sheet, by the pixel of the mask at its middle, shape (rows - 1, cols - 1)."""
+    rows, cols = (count - 1 for count in scene.sheet.points)
+    cells = np.ones((rows, cols), bool)
+    if (mask := scene.sheet.mask) is not None:
+        picture = np.array(Image.open(mask.image).convert("L"))
+        for i, j in np.ndindex(rows, cols):
+            pixel = picture[int((i + 0.5) / rows * picture.shape[0]), int((j + 0.5) / cols * picture.shape[1])]
+            cells[i, j] = (pixel >= 128) != mask.invert
+    return cells
+
+
+def triangles(surface: Array, cells: NDArray[np.bool_]) -> Iterator[Array]:
+    """Yield the triangles of the cells that are sheet; each triangle has the shape (3, k).
+
+    Args:
+        surface: refined vertices, shape (rows, cols, k).
+        cells: whether each cell is sheet, shape of the cells before the refinement.
+    """
+    n = (surface.shape[0] - 1) // cells.shape[0]
+    for r, c in np.argwhere(cells.repeat(n, axis=0).repeat(n, axis=1)):
         corners = surface[r, c], surface[r + 1, c], surface[r + 1, c + 1], surface[r, c + 1]
         yield np.array(corners[:3])
         yield np.array([corners[0], *corners[2:]])
@@ -191,7 +210,7 @@ def draw(
     buffer = rasterise(scene, position, factor, (texture.shape[1], texture.shape[0]), camera)
     sheet = np.isfinite(buffer.depth)
     u, v = np.where(sheet, buffer.u, 0), np.where(sheet, buffer.v, 0)
-    normal = normals_at(normals(position), u, v) * buffer.front[..., None]
+    normal = normals_at(normals(position, present(scene)), u, v) * buffer.front[..., None]
     if scene.render.shading == "tissue":
         lit = tissue(scene, camera, texture, normal, buffer.depth, (u, v, buffer.footprint), rods)
     else:

@@ -183,7 +183,7 @@ def energy(scene: Scene, displacement: Array, assembled: Sheet | None = None) ->
     """
     assembled, total = assembled or sheet(scene), 0.0
     if not assembled.is_curved:
-        total = assembled.bending / 2 * float((_laplacian(scene, displacement) ** 2).sum())
+        total = float((assembled.bending * _laplacian(scene, displacement) ** 2).sum()) / 2
     for springs in assembled.springs:
         between, length = _ends_apart(springs, displacement)
         rest = springs.length - springs.unstretched
@@ -362,7 +362,9 @@ def steps(plan: Plan, assembled: Sheet | None = None) -> Iterator[tuple[Array, C
     """
     scene = plan.scene
     h, assembled = plan.grid.step, assembled or sheet(scene)
-    m, g = assembled.mass[..., None], (assembled.drag / assembled.mass)[..., None]
+    # Points without sheet, which never move, have no mass.
+    mass = np.where(assembled.mass == 0, 1, assembled.mass)
+    m, g = mass[..., None], (assembled.drag / mass)[..., None]
     moves, contact = ~plan.fixed[..., None], Contact(plan, assembled)
     loads: Schedule | Loads = step_loads(plan) if assembled.is_curved else average_loads(plan, 0, plan.grid.steps)
     relaxation = Relaxation(scene, h)

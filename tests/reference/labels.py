@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from taichi_msm.model.surface import Solid
 from taichi_msm.render.camera import view
 from taichi_msm.scene.scene import Scene
-from tests.reference.drawing import rasterise, refine, triangles, weights
+from tests.reference.drawing import present, rasterise, refine, triangles, weights
 from tests.reference.lens import distort
 from tests.reference.shading import intersect
 from tests.reference.surface import rest_positions
@@ -83,7 +83,7 @@ def project(scene: Scene, coordinates: Array, position: Array) -> tuple[Array, N
     hidden: NDArray[np.bool_] = np.logical_not(((pixels >= 0) & (pixels < (width, height))).all(axis=1))
     rest = rest_positions(scene.sheet.surface, scene.sheet.points, scene.sheet.size)
     limit = projected[:, 3] - TOUCHING * float(np.ptp(rest, axis=(0, 1)).max())
-    for triangle in triangles(surface):
+    for triangle in triangles(surface, present(scene)):
         share = weights(triangle, x, y)
         w, depth = np.tensordot(triangle[:, 2:].T, share, 1)
         hidden |= (share >= 0).all(axis=0) & (w > camera.near) & (depth < limit)

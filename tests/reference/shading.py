@@ -16,10 +16,24 @@ from tests.reference.lens import undistorted
 Array = NDArray[np.float64]
 
 
-def normals(position: Array) -> Array:
-    """Return unit normals of mass points, toward +z at rest, shape (rows, cols, 3), from central differences."""
-    right = np.gradient(position, axis=1)
-    up = -np.gradient(position, axis=0)
+def _slope(position: Array, cells: NDArray[np.bool_]) -> Array:
+    """Return the mean step to the neighbours in the same row, of sides of cells that are sheet, else 0."""
+    step = np.diff(position, axis=1)
+    is_side = np.pad(cells, ((1, 1), (0, 0)))
+    step = np.pad(step * (is_side[1:] | is_side[:-1])[..., None], ((0, 0), (1, 1), (0, 0)))
+    count = np.pad(is_side[1:] | is_side[:-1], ((0, 0), (1, 1))).astype(int)
+    return np.asarray((step[:, 1:] + step[:, :-1]) / np.maximum(count[:, 1:] + count[:, :-1], 1)[..., None])
+
+
+def normals(position: Array, cells: NDArray[np.bool_]) -> Array:
+    """Return unit normals of mass points, toward +z at rest, shape (rows, cols, 3), from central differences.
+
+    Args:
+        position: positions of the mass points [m], shape (rows, cols, 3).
+        cells: whether each cell is sheet, shape (rows - 1, cols - 1).
+    """
+    right = _slope(position, cells)
+    up = -_slope(position.swapaxes(0, 1), cells.T).swapaxes(0, 1)
     normal = np.cross(right, up)
     length = np.linalg.norm(normal, axis=-1, keepdims=True)
     return np.divide(normal, length, out=np.zeros_like(normal), where=length > 0)

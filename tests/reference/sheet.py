@@ -14,6 +14,7 @@ from taichi_msm.model.sheet import MapImage, cell_factors, point_factors, read_m
 from taichi_msm.scene.scene import Scene
 from taichi_msm.scene.sheet import StiffnessMap, Tissue
 from tests.reference import surface as curved
+from tests.reference.mask import cell_counts, present_cells
 
 Array = NDArray[np.float64]
 Window = tuple[slice, slice]
@@ -38,7 +39,7 @@ class Sheet(NamedTuple):
     mass: Array  # of every point [kg], shape (rows, cols)
     drag: Array  # C of every point [N s/m], shape (rows, cols)
     virtual: Array  # K of every point [N/m], shape (rows, cols)
-    bending: Any  # D dx dy [N m3]
+    bending: Any  # D dx dy [N m3], a number; with a mask of every point with four neighbours, 0 at an outline
     share: Array  # area of every point as a share of a cell's, shape (rows, cols)
     rest: Array  # rest positions [m], shape (rows, cols, 3)
     normal: Array  # unit normals at rest, shape (rows, cols, 3)
@@ -51,11 +52,11 @@ ALONG_ROW, ALONG_COLUMN, TO_RIGHT, TO_LEFT = (0, 1), (1, 0), (1, 1), (1, -1)
 
 
 def _factors(scene: Scene) -> Array:
-    """Return the stiffness factor at the centre of every cell, shape (rows - 1, cols - 1); ones without a map."""
-    rows, cols = scene.sheet.points
+    """Return the factor at the centre of every cell, shape (rows - 1, cols - 1); 1 without a map, 0 without sheet."""
+    present = present_cells(scene.sheet).astype(float)
     if scene.stiffness_map is None:
-        return np.ones((rows - 1, cols - 1))
-    return cell_factors(scene.stiffness_map, _image(scene.stiffness_map), scene.sheet)
+        return present
+    return present * cell_factors(scene.stiffness_map, _image(scene.stiffness_map), scene.sheet)
 
 
 def _foundation_factors(scene: Scene) -> Array:
@@ -123,15 +124,16 @@ def _curved(scene: Scene, rest: Array) -> Sheet:
     tissue = scene.tissue
     if tissue is None:
         return _of_springs(scene, rest, is_curved=True)
-    measured, factor, membrane = curved.cells(rest), _factors(scene), tissue.young * tissue.thickness
-    area = curved.point_areas(measured)
+    present, factor, membrane = present_cells(scene.sheet), _factors(scene), tissue.young * tissue.thickness
+    measured = curved.cells(rest)
+    area = curved.point_areas(measured, present)
     stretch = tissue.pretension / (3 / 2 * membrane)
     along_row, along_column, to_right, to_left = np.moveaxis(membrane * measured.constants, -1, 0)
     families = {
-        ALONG_ROW: (_rows_of(factor * along_row), _rows_of(along_row)),
-        ALONG_COLUMN: (_columns_of(factor * along_column), _columns_of(along_column)),
-        TO_RIGHT: (factor * to_right, to_right),
-        TO_LEFT: (factor * to_left, to_left),
+        ALONG_ROW: (_rows_of(factor * along_row), _rows_of(present * along_row)),
+        ALONG_COLUMN: (_columns_of(factor * along_column), _columns_of(present * along_column)),
+        TO_RIGHT: (factor * to_right, present * to_right),
+        TO_LEFT: (factor * to_left, present * to_left),
     }
     springs = []
     for ahead, (k, k1) in families.items():
@@ -140,8 +142,8 @@ def _curved(scene: Scene, rest: Array) -> Sheet:
         springs.append(_springs_between(rest, ahead, square * k, stretch * square * k1))
     mass = (tissue.density or 0.0) * tissue.thickness * area
     virtual = tissue.foundation_stiffness * area * _foundation_factors(scene)
-    share = _rows_of(_columns_of(np.ones_like(factor))) / 4
-    drag, normal = tissue.damping * mass, curved.normals(measured)
+    share = _rows_of(_columns_of(present.astype(float))) / 4
+    drag, normal = tissue.damping * mass, curved.normals(measured, present)
     return Sheet(tuple(springs), mass, drag, virtual, 0.0, share, rest, normal, area, is_curved=True)
 
 
@@ -168,8 +170,8 @@ def highest_frequency(scene: Scene, rest: Array | None = None) -> float:
     of_springs = 1.0 if stiffening is None else stiffening.factor
     of_foundation = 1.0 if foundation is None else tissue.foundation.factor  # type: ignore[union-attr]
     bounds = curved.stiffness_bounds(assembled.rest, cell_stiffness(scene, assembled.rest))
-    total = of_springs * curved.sum_at_corners(bounds) + of_foundation * assembled.virtual
-    return math.sqrt(float((total / assembled.mass).max()))
+    total, part = of_springs * curved.sum_at_corners(bounds) + of_foundation * assembled.virtual, assembled.mass > 0
+    return math.sqrt(float((total[part] / assembled.mass[part]).max()))
 
 
 def largest_pressure(assembled: Sheet, free: NDArray[np.bool_]) -> float:
@@ -184,14 +186,14 @@ def largest_pressure(assembled: Sheet, free: NDArray[np.bool_]) -> float:
         tau = springs.stiffness * (springs.length - springs.unstretched) / springs.length
         force[springs.start] += tau[..., None] * springs.offset
         force[springs.end] -= tau[..., None] * springs.offset
-    pressure = np.abs((force * assembled.normal).sum(axis=-1)) / assembled.area
-    return float(pressure[free].max())
+    pressure = np.abs((force * assembled.normal).sum(axis=-1))[free] / assembled.area[free]
+    return float(pressure.max())
 
 
 def _of_tissue(scene: Scene, tissue: Tissue) -> Sheet:
     dx, dy = spacing(scene.sheet)
-    factor, membrane = _factors(scene), tissue.young * tissue.thickness
-    cells = np.ones_like(factor)
+    factor, membrane, present = _factors(scene), tissue.young * tissue.thickness, present_cells(scene.sheet)
+    cells = present.astype(float)
     along_row = membrane * (9 / 8 * dy / dx - 3 / 8 * dx / dy) / 2
     along_column = membrane * (9 / 8 * dx / dy - 3 / 8 * dy / dx) / 2
     diagonal = 3 / 16 * membrane * (dx**2 + dy**2) / (dx * dy)
@@ -206,6 +208,8 @@ def _of_tissue(scene: Scene, tissue: Tissue) -> Sheet:
     mass = (tissue.density or 0.0) * tissue.thickness * dx * dy / 4 * quarters
     plate = tissue.young * tissue.thickness**3 / 12 / (1 - 1 / 9)
     bending = plate if tissue.bending == "plate" else tissue.bending
+    if not present.all():
+        bending = bending * (cell_counts(present) == 4)[1:-1, 1:-1, None]
     virtual = tissue.foundation_stiffness * dx * dy / 4 * quarters * _foundation_factors(scene)
     rest = curved.flat_positions(scene.sheet.points, scene.sheet.size)
     normal = np.zeros_like(rest)

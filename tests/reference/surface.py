@@ -205,14 +205,19 @@ def sum_at_corners(values: Array) -> Array:
     return total
 
 
-def point_areas(cells: Cells) -> Array:
-    """Return the area of each mass point, a quarter of each of its cells [m2], shape (rows, cols)."""
-    return sum_at_corners(cells.area) / 4
+def point_areas(cells: Cells, present: Any = True) -> Array:
+    """Return the area of each mass point, a quarter of each of its cells that are present [m2], shape (rows, cols)."""
+    return sum_at_corners(cells.area * present) / 4
 
 
-def normals(cells: Cells) -> Array:
-    """Return the unit normals of the mass points, along the sum of b x a of their cells, shape (rows, cols, 3)."""
-    normal = sum_at_corners(np.cross(cells.b, cells.a))
+def normals(cells: Cells, present: Any = True) -> Array:
+    """Return the unit normals of the mass points, along the sum of b x a of their cells, shape (rows, cols, 3).
+
+    Those of cells that are not present count at points without any other.
+    """
+    every, share = np.cross(cells.b, cells.a), np.broadcast_to(present, cells.area.shape)[..., None]
+    normal = sum_at_corners(every * share)
+    normal = np.where(sum_at_corners(share * 1.0) > 0, normal, sum_at_corners(every))
     return np.asarray(normal / np.linalg.norm(normal, axis=-1)[..., None])
 
 

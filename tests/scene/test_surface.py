@@ -15,7 +15,7 @@ import pytest
 from numpy.typing import NDArray
 from PIL import Image
 
-from taichi_msm import array_files
+from taichi_msm import array_files, images
 from taichi_msm.accuracy.surface import describe_surface, surface_notes, surface_record
 from taichi_msm.errors import SceneError
 from taichi_msm.load.cost import estimate_budget
@@ -193,7 +193,7 @@ def test_too_large_members(write: Callable[..., Path], message: Messages, monkey
     """The size of an array is known before it is decompressed."""
     Path("p.npz").write_bytes(bomb())
     write("{points: {file: p.npz, unit: mm}}")
-    monkeypatch.setattr(array_files, "available_memory", lambda: 2**28)
+    monkeypatch.setattr(images, "available_memory", lambda: 2**28)
     with message.raises(SceneError, "p.npz needs"):
         load_scene("s.yaml")
     monkeypatch.setattr(array_files, "MAX_BYTES", 2**27)

@@ -17,6 +17,7 @@ from taichi_msm.errors import SceneError
 from taichi_msm.model.plan import Plan
 from taichi_msm.model.sheet import rest_positions
 from taichi_msm.scene.scene import Scene
+from taichi_msm.scene.sheet import Sheet
 from taichi_msm.solver.planning import with_time
 from taichi_msm.study import measurements
 from taichi_msm.study.measurements import (
@@ -137,7 +138,8 @@ def test_reference_in_contact_is_the_finest_run(device: Device) -> None:
 
 def test_meshes_in_contact_are_not_extrapolated() -> None:
     fields = [np.full((count, count, 3), value) for count, value in ((7, 4.0), (13, 2.0), (25, 1.0))]
-    exact, bound = _reference(fields, extrapolate=False)
+    meshes = [Sheet(points=(count, count), size=(1, 1)) for count in (7, 13, 25)]
+    exact, bound = _reference(fields, meshes, extrapolate=False)
     assert exact is fields[-1]
     assert bound == pytest.approx(3**0.5)
 

@@ -1,0 +1,302 @@
+"""Sheets with a mask against the twin: motion, contact, equilibrium, limits of the step, and points without sheet."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from PIL import Image
+
+from taichi_msm.model.mask import Mask
+from taichi_msm.model.rest import rest_of
+from taichi_msm.scene.scene import Scene
+from taichi_msm.scene.sheet import SheetMask
+from taichi_msm.solver.arrays import SheetLayout
+from taichi_msm.solver.dynamics import Dynamics
+from taichi_msm.solver.planning import make_plan
+from taichi_msm.solver.rest import QuasiStatics
+from taichi_msm.solver.sheet_solver import choose_layout
+from taichi_msm.system.runtime import Device
+from taichi_msm.terms import highest_frequency
+from taichi_msm.terms.contact_rest import touched_points
+from taichi_msm.terms.elasticity import energy_density
+from taichi_msm.terms.springs import assemble_springs
+from tests import reference
+from tests.reference.loads import frame_loads
+from tests.reference.mask import cell_counts, held_points, present_cells
+from tests.reference.sheet import highest_frequency as twin_frequency
+from tests.scenes import random_tissue, speckle
+from tests.solver.test_dynamics import as_on_a_gpu
+from tests.solver.test_same_bits import states
+from tests.solver.test_tissue_physics import frequency
+
+# A missing corner, holes of which two meet at a point, a slit one cell wide, a notch at the left side, and two further
+# parts, one of which reaches no side but the bottom. # is sheet.
+CELLS = [
+    "....##########",
+    "##############",
+    "##...#########",
+    "##...#########",
+    "#####..###.###",
+    "##########.###",
+    "##########.###",
+    ".#########.###",
+    "..############",
+    "..............",
+    "#####..#######",
+    "#####..#######",
+    "#####..#######",
+]
+POINTS, SIZE = [14, 15], [0.12, 0.14]
+TISSUE = {"young": 2e4, "thickness": 0.002, "density": 1000, "foundation": 1e5, "damping": 30}
+LOCK: Any = {"stiffening": {"lock": 0.3}, "foundation": {"young": 2e4, "depth": 0.2, "lock": 0.002}}
+MAPS: Any = {
+    "map": {"image": "map.png", "range": [0.7, 3]},
+    "foundation_map": {"image": "map.png", "range": [0.2, 4]},
+}
+TUBE = {"tube": {"radius": 0.04, "folds": {"depth": 0.004, "spacing": 0.03}}}
+LOADS: Any = [
+    {"at": [0.45, 0.6], "total": -0.6, "radius": 0.01, "load": [[0, 0], [0.05, 100]]},
+    {"at": [[0, 0.1, 0.2], [0.1, 0.9, 0.9]], "total": [0.1, 0.2, 0.3], "radius": 0.01, "load": [[0, 100]]},
+    {"at": [0.25, 0.25], "total": [0.1, 0, 0.3], "radius": 0.02},
+]
+BALL: Any = {
+    "path": [[0, 0.3, 0.3, 0.002], [0.04, 0.3, 0.3, -0.004], [0.1, 0.5, 0.5, -0.005]],
+    "instrument": {"radius": 0.012, "shaft": [0.3, 0, 1], "length": 0.03},
+}
+CLAMP: Any = {"clamp": "right", "path": [[0, 0, 0, 0], [0.06, 0.003, 0.002, -0.004]]}
+OUTLINE: Any = {"fixed": ["outline"]}
+
+CASES: dict[str, Any] = {
+    "loads": {"probes": LOADS},
+    "locking": {"tissue": LOCK, "probes": LOADS},
+    "maps": {"tissue": {**LOCK, **MAPS}, "probes": LOADS[1:]},
+    "no foundation": {"tissue": {"foundation": 0, "damping": 0}, "fixed": "corners", "probes": LOADS},
+    "tense, maps, relaxing": {
+        **OUTLINE,
+        "tissue": {
+            "pretension": 3, **MAPS, "foundation_active": "always", "relaxation": [{"share": 0.4, "time": 0.05}]
+        },
+        "probes": LOADS,
+    },
+    "bending": {**OUTLINE, "tissue": {"bending": 2e-5}, "probes": LOADS},
+    "tense plate": {"fixed": ["left", "outline"], "tissue": {"bending": "plate", "pretension": 2}, "probes": [BALL]},
+    "ball": {"probes": [BALL, LOADS[1]]},
+    "friction": {"probes": [{**BALL, "friction": 0.4}, LOADS[1]]},
+    "grip": {"probes": [{**BALL, "grip": [[0.05, 0.2]]}]},
+    "clamp": {
+        "tissue": {"relaxation": [{"share": 0.3, "time": 0.1}], "foundation_active": "always"},
+        "probes": [CLAMP, BALL],
+    },
+    "tube": {"surface": TUBE, "probes": [{**BALL, "friction": 0.4}, *LOADS]},
+    "tube, ball": {"surface": TUBE, "probes": [BALL]},
+    "dome, tense, locking": {
+        **OUTLINE,
+        "surface": {"dome": {"radius": 0.1}},
+        "tissue": {**LOCK, "pretension": 3, "map": MAPS["map"]},
+        "probes": LOADS,
+    },
+}  # fmt: skip
+
+# Each case has other terms, and therefore other kernels.
+DEFAULT = pytest.mark.default_cases("loads", "tense, maps, relaxing", "tense plate", "tube")
+
+
+@pytest.fixture(autouse=True)
+def pictures(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    write_mask(CELLS)
+    Image.fromarray(speckle(7, 9)[..., 0]).save("map.png")
+
+
+def write_mask(cells: list[str]) -> None:
+    """Write mask.png with one pixel per cell; # is white."""
+    Image.fromarray(np.array([[255 * (pixel == "#") for pixel in row] for row in cells], np.uint8)).save("mask.png")
+
+
+def scene_of(case: str, sheet: Any = None, **time: Any) -> Scene:
+    """Scene of a case, free except on the left."""
+    keys = CASES[case]
+    own = {"points": POINTS, "size": SIZE, "fixed": keys.get("fixed", ["left"]), "mask": {"image": "mask.png"}}
+    return Scene(
+        output=[],
+        sheet={**own, "surface": keys.get("surface"), **(sheet or {})},
+        tissue={**TISSUE, **keys.get("tissue", {})},
+        probes=keys["probes"],
+        time={"duration": 0.1, "frames_per_second": 50, "precision": "f64", **time},
+    )
+
+
+def frames(scene: Scene, device: Device, layout: SheetLayout | None = None) -> NDArray[Any]:
+    plan = make_plan(scene)
+    dynamics, displacements = Dynamics(plan, device, layout), []
+    for _ in range(plan.grid.frames):
+        dynamics.advance(plan.grid.steps_per_frame)
+        displacements.append(dynamics.displacement())
+    return np.array(displacements)
+
+
+@DEFAULT
+@pytest.mark.parametrize("case", CASES)
+def test_motion_matches_twin(case: str, device: Device) -> None:
+    scene = scene_of(case)
+    plan = make_plan(scene)
+    twin = [u for u, _ in reference.steps(plan)]
+    expected = np.array(twin[plan.grid.steps_per_frame :: plan.grid.steps_per_frame])
+    assert np.abs(expected).max() > 1e-3
+    # A rounding per step, amplified by the number of steps.
+    atol = 1e-13 * np.abs(expected).max() * plan.grid.steps
+    np.testing.assert_allclose(frames(scene, device), expected, rtol=0, atol=atol)
+
+
+@pytest.mark.parametrize("case", CASES)
+def test_material_matches_twin(case: str) -> None:
+    scene = scene_of(case)
+    plan, twin = make_plan(scene), reference.sheet(scene)
+    np.testing.assert_array_equal(rest_of(scene.sheet).present, present_cells(scene.sheet))
+    np.testing.assert_array_equal(plan.fixed, held_points(scene.sheet))
+    np.testing.assert_allclose(plan.material.mass * plan.area_shares, twin.mass, rtol=1e-12, atol=0)
+    springs = assemble_springs(plan.material, scene.sheet)
+    for k, tau, own in zip(springs.stiffness, springs.tension, twin.springs, strict=True):
+        np.testing.assert_allclose(k, own.stiffness, rtol=1e-12, atol=0)
+        pull = own.stiffness * (own.length - own.unstretched) / own.length
+        np.testing.assert_allclose(tau, pull, rtol=0, atol=1e-12 * own.stiffness.max())
+    # The bound is section 1's, without those of points that no force moves; bending adds its own.
+    if not plan.material.bending:
+        frequency = highest_frequency(plan.material, scene.sheet)
+        assert frequency == pytest.approx(twin_frequency(scene), rel=1e-12)
+
+
+@DEFAULT
+@pytest.mark.parametrize("case", CASES)
+def test_energy_and_strains_match_twin(case: str, device: Device) -> None:
+    """Springs without stiffness have no strain."""
+    scene = scene_of(case)
+    plan, twin = make_plan(scene), reference.sheet(scene)
+    dynamics = Dynamics(plan, device)
+    dynamics.advance(3 * plan.grid.steps_per_frame)
+    reading, difference = dynamics.read(), dynamics.state().difference
+    kinetic = float((twin.mass[..., None] * difference**2).sum()) / plan.grid.step**2 / 2
+    elastic = reference.energy(scene, reading.displacement)
+    assert reading.energy == pytest.approx(kinetic + elastic, rel=1e-10)
+    for value, of in ((reading.shortest_spring, "shortest_spring"), (reading.longest_spring, "longest_spring")):
+        assert value == pytest.approx(getattr(reference, of)(scene, reading.displacement), rel=1e-12)
+    # The density times the area is the energy, which is relative to the state at rest.
+    density, areas = energy_density(plan, reading.displacement), plan.area_shares * rest_of(scene.sheet).cell_area
+    bent = 0.0
+    if plan.material.bending:
+        bent = elastic - reference.energy(scene, reading.displacement, twin._replace(bending=0.0))
+    assert (density * areas).sum() == pytest.approx(elastic - bent, rel=1e-10)
+    assert not density[plan.area_shares == 0].any()
+
+
+@pytest.mark.parametrize("precision", ["f32", "f64"])
+@pytest.mark.parametrize("case", ["tense, maps, relaxing", "tube"])
+def test_points_without_sheet_stay(case: str, precision: str, device: Device) -> None:
+    scene = scene_of(case, precision=precision)
+    plan, absent = make_plan(scene), cell_counts(present_cells(scene.sheet)) == 0
+    dynamics = Dynamics(plan, device)
+    for _ in range(plan.grid.frames):
+        dynamics.advance(plan.grid.steps_per_frame)
+        reading, state = dynamics.read(), dynamics.state()
+        assert not reading.displacement[absent].any()
+        assert not state.difference[absent].any()
+        assert np.isfinite(reading.displacement).all()
+        assert np.isfinite([reading.energy, reading.shortest_spring, reading.longest_spring]).all()
+        assert np.isfinite(dynamics.tool_forces()).all()
+        assert np.isfinite(state.memory).all()
+    assert reading.energy > 0
+
+
+@pytest.mark.default_cases("tense, maps, relaxing")
+@pytest.mark.parametrize("case", CASES)
+def test_bits_are_those_of_bands_passes_gathering_and_restarts(case: str, device: Device) -> None:
+    scene = scene_of(case)
+    layout = choose_layout(make_plan(scene), device)
+    # With bending a pass takes one step.
+    depth = 3 if layout.config.reach == 1 else 1
+    expected = states(scene, device, layout)
+    assert states(scene, device, replace(layout, workers=2, depth=depth), restarts=True) == expected
+    assert states(scene, device, as_on_a_gpu(layout), restarts=True) == expected
+
+
+@pytest.mark.default_cases("tense plate")
+@pytest.mark.parametrize("case", ["maps", "bending", "tense plate", "ball", "tube, ball", "dome, tense, locking"])
+def test_equilibrium_has_no_force(case: str, device: Device) -> None:
+    scene = scene_of(case, motion="quasistatic")
+    rest = QuasiStatics(make_plan(scene), device)
+    rest.advance(5)
+    u = rest.displacement()
+    assert np.abs(u).max() > 1e-3
+    assert not u[cell_counts(present_cells(scene.sheet)) == 0].any()
+    free = ~rest.plan.fixed & ~touched_points(len(rest.plan.tools), rest.state().memory).any(axis=0)
+    # The criterion is 1e-7 of the largest force of a spring.
+    assert reference.residual(scene, u, frame_loads(rest.plan, 5), free) < 2e-7
+
+
+# The largest ratio of the bound to the highest frequency; with maps it is larger.
+RATIOS = {"loads": 1.25, "bending": 1.25, "tense plate": 1.25, "tube": 1.25, "maps": 1.25, "dome, tense, locking": 1.6}
+
+
+@pytest.mark.parametrize("case", RATIOS)
+def test_bound_of_frequencies(case: str) -> None:
+    """The highest frequency of the twin's free points is below the bound, and near it; without laws."""
+    scene = scene_of(case)
+    assert scene.tissue is not None
+    linear = scene.tissue.model_copy(update={"stiffening": None, "foundation": 1e5})
+    scene = scene.model_copy(update={"tissue": linear})
+    true, bound = frequency(scene), highest_frequency(make_plan(scene).material, scene.sheet)
+    assert true < bound < RATIOS[case] * true
+
+
+@pytest.mark.parametrize("fixed", ["outline", "none"])
+def test_rectangle_of_a_mask_is_a_smaller_sheet(fixed: str, device: Device) -> None:
+    """Five rows and six columns of cells in the middle; loads and tools are at the same places."""
+    write_mask(["." * 14] * 3 + ["....######...."] * 5 + ["." * 14] * 5)
+    place = {"at": [0.5, 0.5], "total": [0.1, 0, -0.3], "radius": 0.01}
+    ball = {"path": [[0, 0.5, 0.5, 0], [0.1, 0.5, 0.5, -0.004]], "instrument": BALL["instrument"]}
+    at = (0.5 * 14 - 4) / 6, (0.5 * 13 - 3) / 5
+    moved = {**place, "at": at}, {**ball, "path": [[t, *at, z] for t, _, _, z in ball["path"]]}
+    masked = {"points": POINTS, "size": SIZE, "mask": {"image": "mask.png"}, "fixed": fixed}
+    whole = {"points": [6, 7], "size": [5 * SIZE[0] / 13, 0.06], "fixed": "border" if fixed == "outline" else "none"}
+    time = {"duration": 0.1, "frames_per_second": 50, "precision": "f64"}
+    large, small = (
+        Scene(output=[], sheet=sheet, tissue={**TISSUE, **LOCK}, probes=probes, time=time)
+        for sheet, probes in ((masked, (place, ball)), (whole, moved))
+    )
+    assert make_plan(large).stable_step == pytest.approx(make_plan(small).stable_step, rel=1e-12)
+    u = frames(small, device)
+    assert np.abs(u).max() > 1e-3
+    np.testing.assert_allclose(frames(large, device)[:, 3:9, 4:11], u, rtol=0, atol=1e-12 * np.abs(u).max())
+
+
+def random_cells(seed: int, rows: int, cols: int) -> NDArray[np.bool_]:
+    """Two thirds of the cells at random; of two parts that meet at a point one cell more is sheet."""
+    cells = np.random.default_rng(seed).random((rows, cols)) < 2 / 3
+    while pinched := next(Mask(cells).pinched_points(), None):
+        cells[pinched[0] - 1, pinched[1]] = cells[pinched] = True
+    return cells
+
+
+@pytest.mark.default_cases("0")
+@pytest.mark.parametrize("seed", range(24))
+def test_random_masks_match_twin(seed: int, device: Device) -> None:
+    """Tissues of `random_tissue`, whose sides are free or fixed, with a border fixed as an outline."""
+    made = random_tissue(seed, "map.png")
+    rows, cols = made.sheet.points
+    write_mask(["".join("#" if cell else "." for cell in row) for row in random_cells(seed, rows - 1, cols - 1)])
+    fixed = "outline" if made.sheet.fixed == "border" else made.sheet.fixed
+    sheet = made.sheet.model_copy(update={"mask": SheetMask(image="mask.png"), "fixed": fixed})
+    made = made.model_copy(update={"sheet": sheet})
+    plan = make_plan(made)
+    twin = [u for u, _ in reference.steps(plan)]
+    expected = np.array(twin[plan.grid.steps_per_frame :: plan.grid.steps_per_frame])
+    atol = 1e-12 * np.abs(expected).max()
+    np.testing.assert_allclose(frames(made, device), expected, rtol=0, atol=atol)
+    layout = choose_layout(plan, device)
+    gathered = replace(layout, workers=0, config=replace(layout.config, lanes=1))
+    np.testing.assert_allclose(frames(made, device, gathered), expected, rtol=0, atol=atol)
