@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from taichi_msm.model.mask import Mask
+from taichi_msm.model.geometry import Rest
 
 # Unknown flow in the Middlebury format.
 NO_FLOW = 1e10
@@ -27,12 +27,15 @@ class Labels(NamedTuple):
         normals: unit normals of the drawn triangle or the instrument's surface, toward the camera, in OpenCV's axes (x
             right, y down, z forward), shape (height, width, 3); NaN where nothing is visible. Shape (0, 0, 3) if the
             scene does not request normals.
+        mesh: with a picture by a camera, whose fractions are the coordinates, also the fractions (u, v) of columns and
+            rows, shape (height, width, 2); NaN where the sheet is not visible. Shape (0, 0, 2) without such a picture.
     """
 
     coordinates: NDArray[np.float32]
     depth: NDArray[np.float32]
     instrument: NDArray[np.uint8]
     normals: NDArray[np.float32] = np.empty((0, 0, 3), np.float32)
+    mesh: NDArray[np.float32] = np.empty((0, 0, 2), np.float32)
 
 
 class Label(NamedTuple):
@@ -51,6 +54,7 @@ LABELS = {
     "depth": Label(("depth",), 0.0, sheet_only=False, dtype=np.float32),
     "instrument": Label(("instrument",), 0.0, sheet_only=False, dtype=np.uint8),
     "normals": Label(("facet_x", "facet_y", "facet_z"), math.nan, sheet_only=False, dtype=np.float32, is_optional=True),
+    "mesh": Label(("mesh_across", "mesh_down"), math.nan, sheet_only=True, dtype=np.float32, is_optional=True),
 }
 
 
@@ -100,7 +104,9 @@ def labels_of(numbers: NDArray[np.float32], size: tuple[int, int], names: Collec
         values = numbers.reshape(-1, width * height)[offset : offset + count]
         arrays[name] = values.reshape((height, width, count)[: 2 + (count > 1)]).astype(label.dtype, copy=False)
     # Rounding may move coordinates beyond the sheet's edge.
-    arrays["coordinates"] = arrays["coordinates"].clip(0, 1)
+    for name in ("coordinates", "mesh"):
+        if name in arrays:
+            arrays[name] = arrays[name].clip(0, 1)
     return Labels(**arrays)
 
 
@@ -154,12 +160,12 @@ class FrameOutputs(NamedTuple):
     tracks: Sight | None = None
 
 
-def track_grid(count: int, mask: Mask | None = None) -> NDArray[np.float32]:
+def track_grid(count: int, rest: Rest | None = None) -> NDArray[np.float32]:
     """Return the coordinates of the centres of count^2 equal parts of the rectangle, row by row, shape (n, 2).
 
-    Of a masked sheet, those on it.
+    With a sheet, those on it.
     """
     centres = (np.arange(count) + 0.5) / count
     down, across = np.meshgrid(centres, centres, indexing="ij")
     coordinates = np.stack([across, down], axis=-1).reshape(-1, 2)
-    return (coordinates if mask is None else coordinates[mask.covers(coordinates)]).astype(np.float32)
+    return (coordinates if rest is None else coordinates[rest.covers(coordinates)]).astype(np.float32)
