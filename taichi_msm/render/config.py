@@ -112,6 +112,11 @@ class DrawingConfig(NamedTuple):
         return self.picture_lens is not None
 
     @property
+    def picture_stride(self) -> int:
+        """Numbers per mass point at rest in the camera of a picture: to the right, down and forward [m]."""
+        return 3 * self.is_pictured
+
+    @property
     def is_relit(self) -> bool:
         """Whether colours are relative to the light in which the picture was taken."""
         return self.is_pictured and (self.headlit or self.tissue) and not self.writes_light

@@ -306,7 +306,7 @@ def _source_at(s, t, quad_column, quad_row, below, cell: ti.template(), band: ti
     # In the sub-quad, the product s t is replaced by a function that is linear on each side of the diagonal.
     twist = quad_column * quad_row + s * quad_row + quad_column * t + ti.select(below, s, t)
     twist = twist * (quad_side * quad_side)
-    corners = ti.static(geometry.corner_entries(cell.source, band.cols, geometry.PICTURE_STRIDE))
+    corners = ti.static(geometry.corner_entries(cell.source, band.cols, band.config.picture_stride))
     p, right, down, opposite = [triple(band.nodes, entry) for entry in corners]
     h = [
         p[n]
@@ -366,7 +366,7 @@ def store_point(position: ti.template(), i, j, band: ti.template()):
                 band.nodes[normal_entry + n] = dot(triple(band.uniforms, uni.AXES + 3 * n), normal)
     if ti.static(config.is_pictured):
         source_entry = geometry.picture_entry(i * band.cols + j, band)
-        for n in ti.static(range(geometry.PICTURE_STRIDE)):
+        for n in ti.static(range(config.picture_stride)):
             band.nodes[source_entry + n] = position[i, j, 3 + n]
 
 

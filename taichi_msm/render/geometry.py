@@ -23,7 +23,6 @@ SCREEN = 4
 NORMAL_STRIDE = 3
 DISTORTED_STRIDE = 3  # x and y [samples]; 1 in front of the camera and within the limit of the lens, else 0
 POINT_STRIDE = NODE_STRIDE + NORMAL_STRIDE + DISTORTED_STRIDE
-PICTURE_STRIDE = 3  # with a picture by a camera: the point at rest in that camera, to the right, down and forward [m]
 
 # Enlargement of triangles that are drawn one by one, which closes the gaps between them: a fraction of their side, and
 # a fraction of the picture's side, the resolution of f32.
@@ -68,11 +67,6 @@ class Triangle(NamedTuple):
     below: Any  # whether it is the triangle below the diagonal, where t > s
 
 
-def point_stride(config: Any) -> int:
-    """Return the numbers per mass point in `nodes`."""
-    return POINT_STRIDE + PICTURE_STRIDE * config.is_pictured
-
-
 @ti.func
 def project(position: ti.template(), i, j, cols, uniforms: ti.template(), nodes: ti.template(), double: ti.template()):
     """Project a mass point, and store its X, Y, w, depth, x and y; for f64 (`double`), the sum has another order."""
@@ -114,7 +108,7 @@ def point_entries(point, band: ti.template()):
 @ti.func
 def picture_entry(point, band: ti.template()):
     """Return the first entry of a mass point in the picture's camera in `nodes`."""
-    return band.rows * band.cols * POINT_STRIDE + point * PICTURE_STRIDE
+    return band.rows * band.cols * POINT_STRIDE + point * band.config.picture_stride
 
 
 @ti.func

@@ -53,7 +53,7 @@ class Threads:
         # Rows of pixels in a strip.
         self._strip_rows = min(max(1, VULKAN_THREADS // (samples_across * config.supersample)), height)
         self._texels = launches.upload(texels)
-        self._nodes = launches.array(np.float32, rows * cols * geometry.point_stride(config))
+        self._nodes = launches.array(np.float32, rows * cols * (geometry.POINT_STRIDE + config.picture_stride))
         self._pieces = launches.array(np.int32, self._cells)
         strip = self._strip_rows * config.supersample * samples_across * config.planes
         # The undistortion map, empty without lens distortion; then the strip.

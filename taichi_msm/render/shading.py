@@ -111,10 +111,10 @@ def _light(entry, left, top, texels: ti.template(), band: ti.template()):
     if ti.static(config.headlit):
         light = samples[entry + plane.light]
     else:
-        _, slope_x, slope_y = _filter_texture(entry, depth < INFINITY, texels, band)
+        _colour, slope_x, slope_y = _filter_texture(entry, depth < INFINITY, texels, band)
         x, y = undistorted_centres(left, top, entry, band)
         normal = triple(samples, entry + plane.normal_x)
-        factor, _ = _reflect(x, y, depth, normal, slope_x, slope_y, band)
+        factor, _gloss = _reflect(x, y, depth, normal, slope_x, slope_y, band)
         light = ti.max(ti.min(factor, 8.0), 0.0)
     return ti.select(depth < INFINITY, light, -1.0)
 

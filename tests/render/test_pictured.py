@@ -53,7 +53,7 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """Working directory with the picture."""
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
-    Image.fromarray(speckle(WIDTH, HEIGHT)).save("image.png")
+    Image.fromarray(speckle(HEIGHT, WIDTH)).save("image.png")
     return tmp_path
 
 
