@@ -56,8 +56,9 @@ Numbers = NDArray[Any]
 
 def _write_run(run: FinishedRun, folder: Path, progress: ProgressCallback) -> list[str]:
     positions, rest, picture = run.positions(), run.rest(), picture_png(run)
+    mask = rest.mask if rest else None
     # A target has differences of positions and normals, float32.
-    target_bytes = 2 * 3 * 4 * len(mass_points(positions[0], rest))
+    target_bytes = 2 * 3 * 4 * len(mass_points(positions[0], mask))
     max_targets = max(1, min(MAX_TARGETS, MAX_TARGETS_BYTES // target_bytes))
     keys = key_frames(positions, 1 + max_targets, progress)
     asset = {"version": "2.0", "generator": f"taichi_msm {__version__}"}
@@ -89,7 +90,8 @@ def _add_sheet(
     progress: ProgressCallback,
 ) -> None:
     """Add the mesh of the first frame, its material and morph targets, and their animation."""
-    first, normals = refine_surface(positions[0], EXPORT_REFINE, rest), unit_normals(positions[0], rest)
+    mask = rest.mask if rest else None
+    first, normals = refine_surface(positions[0], EXPORT_REFINE, rest), unit_normals(positions[0], mask)
     attributes = glb.attributes(first.vertices, normals)
     if picture is not None:
         attributes["TEXCOORD_0"] = glb.accessor(first.texture_coordinates, GL_ARRAY_BUFFER)
@@ -97,8 +99,8 @@ def _add_sheet(
     targets = []
     for count, frame in enumerate(keys.frames[1:]):
         progress(count, len(keys.frames))
-        displacement = mass_points(positions[frame].astype(np.float64) - positions[0], rest)
-        targets.append(glb.attributes(displacement, unit_normals(positions[frame], rest) - normals))
+        displacement = mass_points(positions[frame].astype(np.float64) - positions[0], mask)
+        targets.append(glb.attributes(displacement, unit_normals(positions[frame], mask) - normals))
     colour = {} if picture is None else {"baseColorTexture": {"index": 0}}
     matte = {**colour, "metallicFactor": 0.0, "roughnessFactor": 1.0}
     glb.add("materials", {"name": "sheet", "doubleSided": True, "pbrMetallicRoughness": matte})

@@ -18,7 +18,7 @@ from PIL import Image
 from taichi_msm.arithmetic import Array
 from taichi_msm.errors import ArgumentError
 from taichi_msm.exports.formats import ANY_CAMERA, FORMATS
-from taichi_msm.model.geometry import Rest
+from taichi_msm.model.mask import Mask
 from taichi_msm.model.surface import Solid, refine_surface
 from taichi_msm.render.texture import load_texture
 from taichi_msm.runs.arrays import read_flo, read_rows
@@ -53,20 +53,19 @@ def encode_picture(picture: NDArray[np.uint8] | NDArray[np.uint16], format: str,
     return file.getvalue()
 
 
-def mass_points(position: NDArray[np.floating], rest: Rest | None) -> NDArray[np.floating]:
+def mass_points(position: NDArray[np.floating], mask: Mask | None) -> NDArray[np.floating]:
     """Return the positions of the mass points with cells, row by row, shape (n, ...), from (rows, cols, ...)."""
-    mask = rest.mask if rest else None
     return position.reshape(-1, *position.shape[2:]) if mask is None else position[mask.points]
 
 
-def unit_normals(position: NDArray[np.floating], rest: Rest | None = None) -> NDArray[np.float64]:
+def unit_normals(position: NDArray[np.floating], mask: Mask | None = None) -> NDArray[np.float64]:
     """Compute the unit normals of the sheet at its `mass_points`, as used for shading, shape (n, 3).
 
     Tangents are central differences, one-sided at edges. The normals of the flat sheet are z; a normal that vanishes at
     a fold is replaced by z.
     """
     rows, cols = position.shape[:2]
-    cells = np.ones((rows - 1, cols - 1), bool) if rest is None else rest.present
+    cells = np.ones((rows - 1, cols - 1), bool) if mask is None else mask.cells
     # Whether each mass point has a cell to its upper left, and so on; neighbours without a cell between are not used.
     upper, lower = np.pad(cells, ((1, 0), (1, 1))), np.pad(cells, ((0, 1), (1, 1)))
     upper_left, upper_right, lower_left, lower_right = upper[:, :-1], upper[:, 1:], lower[:, :-1], lower[:, 1:]
@@ -74,7 +73,7 @@ def unit_normals(position: NDArray[np.floating], rest: Rest | None = None) -> ND
     position = position.astype(np.float64)
     right = position[i, j + (upper_right | lower_right)] - position[i, j - (upper_left | lower_left)]
     up = position[i - (upper_left | upper_right), j] - position[i + (lower_left | lower_right), j]
-    normal = mass_points(np.cross(right, up), rest)
+    normal = mass_points(np.cross(right, up), mask)
     length = np.linalg.norm(normal, axis=-1, keepdims=True)
     return np.divide(normal, length, out=np.tile([0.0, 0.0, 1.0], (len(normal), 1)), where=length > 0)
 

@@ -33,6 +33,7 @@ MATERIAL_FILE = "surface.mtl"
 
 def _write_run(run: FinishedRun, folder: Path, progress: ProgressCallback) -> list[str]:
     positions, rest, picture = run.positions(), run.rest(), picture_png(run)
+    mask = rest.mask if rest else None
     if picture is not None:
         write_new_file(folder / PICTURE_FILE, picture)
     # A matte material.
@@ -46,9 +47,9 @@ def _write_run(run: FinishedRun, folder: Path, progress: ProgressCallback) -> li
         progress(frame, run.frames)
         with io.TextIOWrapper(create_file(folder / f"{frame:04}.obj"), "ascii", newline="") as file:
             file.write(f"# {run.time[frame]:g} s, in metres\nmtllib {MATERIAL_FILE}\n")
-            file.write(_lines("v", mass_points(position, rest)))
+            file.write(_lines("v", mass_points(position, mask)))
             file.write(coordinates)
-            file.write(_lines("vn", unit_normals(position, rest)))
+            file.write(_lines("vn", unit_normals(position, mask)))
             file.write(f"usemtl sheet\n{faces}")
     return []
 

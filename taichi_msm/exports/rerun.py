@@ -117,7 +117,8 @@ def _log_run(run: FinishedRun, recording: Any, progress: ProgressCallback) -> No
 
 def _mesh(run: FinishedRun, position: NDArray[np.floating], rest: Rest | None, *, is_first: bool) -> Any:
     """Build the mesh of the first frame, or only vertices of a later one; the viewer keeps triangles and texture."""
-    points, normals = mass_points(position, rest), unit_normals(position, rest)
+    mask = rest.mask if rest else None
+    points, normals = mass_points(position, mask), unit_normals(position, mask)
     vertices: dict[str, Any] = {"vertex_positions": points, "vertex_normals": normals}
     if not is_first:
         return rerun.Mesh3D.from_fields(**vertices)

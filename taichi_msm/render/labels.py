@@ -27,15 +27,21 @@ class Labels(NamedTuple):
         normals: unit normals of the drawn triangle or the instrument's surface, toward the camera, in OpenCV's axes (x
             right, y down, z forward), shape (height, width, 3); NaN where nothing is visible. Shape (0, 0, 3) if the
             scene does not request normals.
-        mesh: with a picture by a camera, whose fractions are the coordinates, also the fractions (u, v) of columns and
-            rows, shape (height, width, 2); NaN where the sheet is not visible. Shape (0, 0, 2) without such a picture.
     """
 
     coordinates: NDArray[np.float32]
     depth: NDArray[np.float32]
     instrument: NDArray[np.uint8]
     normals: NDArray[np.float32] = np.empty((0, 0, 3), np.float32)
-    mesh: NDArray[np.float32] = np.empty((0, 0, 2), np.float32)
+
+
+class PicturedLabels(Labels):
+    """Labels of a sheet with a picture by a camera, whose fractions are the coordinates.
+
+    `mesh` are the fractions (u, v) of columns and rows, shape (height, width, 2), NaN where the sheet is not visible.
+    """
+
+    mesh: NDArray[np.float32]
 
 
 class Label(NamedTuple):
@@ -48,7 +54,7 @@ class Label(NamedTuple):
     is_optional: bool = False  # whether the label is written only on request
 
 
-# The fields of `Labels`.
+# The fields of `Labels` and `PicturedLabels`.
 LABELS = {
     "coordinates": Label(("across", "down"), math.nan, sheet_only=True, dtype=np.float32),
     "depth": Label(("depth",), 0.0, sheet_only=False, dtype=np.float32),
@@ -107,7 +113,12 @@ def labels_of(numbers: NDArray[np.float32], size: tuple[int, int], names: Collec
     for name in ("coordinates", "mesh"):
         if name in arrays:
             arrays[name] = arrays[name].clip(0, 1)
-    return Labels(**arrays)
+    mesh = arrays.pop("mesh", None)
+    if mesh is None:
+        return Labels(**arrays)
+    labels = PicturedLabels(**arrays)
+    labels.mesh = mesh
+    return labels
 
 
 class Flow(NamedTuple):

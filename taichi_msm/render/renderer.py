@@ -105,9 +105,9 @@ class Renderer:
         on_sheet = points.dtype.kind == "f" and not ((points < 0) | (points > 1)).any()
         if points.shape != (height, width, 2) or not on_sheet:
             raise ArgumentError(f"before: take the result of `labels` for a picture of {width} x {height} pixels")
-        from taichi_msm.render.tracking import compute_flow
+        from taichi_msm.render.tracking import compute_flow, mesh_of
 
-        return compute_flow(self.scene, before, shot)
+        return compute_flow(self.scene, mesh_of(self.scene, before), shot)
 
     def locate(self, coordinates: Array, shot: Shot) -> Sight:
         """Project material points, with coordinates on the sheet, shape (n, 2), and determine their occlusion.

@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from taichi_msm.model.pictured import PicturedRest
 from taichi_msm.model.rest import rest_of
 from taichi_msm.render import geometry, lens_kernels
 from taichi_msm.render import uniforms as uni
@@ -20,7 +21,7 @@ from taichi_msm.render.camera import Shot
 from taichi_msm.render.config import INFINITY, Bytes, Doubles, Floats, Integers, is_present
 from taichi_msm.render.coverage import intersect_instrument
 from taichi_msm.render.geometry import NODE_STRIDE
-from taichi_msm.render.labels import NO_FLOW, Flow, Labels, Sight
+from taichi_msm.render.labels import NO_FLOW, Flow, Labels, PicturedLabels, Sight
 from taichi_msm.render.undistortion import undistorted_view
 from taichi_msm.scene.scene import Scene
 from taichi_msm.system.launches import Launches, end_thread
@@ -53,13 +54,21 @@ def locate_points(scene: Scene, coordinates: Array, shot: Shot) -> Sight:
     return Sight(pixels, hidden.view(np.bool_))
 
 
-def compute_flow(scene: Scene, before: Labels, shot: Shot) -> Flow:
-    """Compute the optical flow from another frame, with the labels `before`, to this one."""
-    coordinates = np.asarray(before.coordinates)
-    shape, mesh = coordinates.shape[:2], before.mesh
-    if mesh.shape != coordinates.shape:
-        on_sheet, mesh = ~np.isnan(coordinates[..., 0]), np.full(coordinates.shape, np.nan)
-        mesh[on_sheet] = rest_of(scene.sheet).mesh_places(coordinates[on_sheet])
+def mesh_of(scene: Scene, labels: Labels) -> Array:
+    """Return the (u, v) of labels, shape (height, width, 2), NaN where the sheet is not visible."""
+    coordinates, rest = np.asarray(labels.coordinates), rest_of(scene.sheet)
+    if not isinstance(rest, PicturedRest):
+        return coordinates
+    if isinstance(labels, PicturedLabels):
+        return labels.mesh
+    on_sheet, mesh = ~np.isnan(coordinates[..., 0]), np.full(coordinates.shape, np.nan)
+    mesh[on_sheet] = rest.mesh_places(coordinates[on_sheet])
+    return mesh
+
+
+def compute_flow(scene: Scene, mesh: Array, shot: Shot) -> Flow:
+    """Compute the optical flow from another frame, whose labels have this `mesh_of`, to this one."""
+    shape = mesh.shape[:2]
     moved, hidden = _track(scene, mesh.reshape(-1, 2), shot, as_flow=True)
     return Flow(moved.reshape(*shape, 2), hidden.reshape(shape) * np.uint8(255))
 
@@ -69,7 +78,7 @@ def compute_stereo(scene: Scene, labels: Labels, shot: Shot) -> Flow:
     view = shot.view
     assert view.companion is not None
     companion_shot = shot._replace(view=view.companion)
-    flow, occlusion = compute_flow(scene, labels, companion_shot)
+    flow, occlusion = compute_flow(scene, mesh_of(scene, labels), companion_shot)
     instrument_pixels = np.argwhere(labels.instrument)
     if len(instrument_pixels):
         y, x = instrument_pixels.T

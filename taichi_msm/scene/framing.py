@@ -15,7 +15,7 @@ from taichi_msm.scene.surface import Frame
 # A camera at the origin that looks along -z, with x to the right and y up, in the convention of `Pose`.
 POSE_AT_ORIGIN = {"rotation": [[1, 0, 0], [0, -1, 0], [0, 0, -1]], "translation": [0, 0, 0]}
 
-# The light on a picture by a camera, by default.
+# The light on a picture by a camera by default: the gloss is in the picture.
 MATTE = {"gloss": 0.0}
 
 # Name of the main camera in `picture` if it has none.
@@ -34,9 +34,7 @@ def framed_image_size(data: Mapping[str, Any]) -> tuple[int, int] | None:
 
 
 def complete_framed(data: Mapping[str, Any], size: tuple[int, int]) -> Mapping[str, Any]:
-    """Add to the sections of a scene the size of its pictures, a light without gloss, which the image has already, and
-    the pose of the camera of a depth map.
-    """
+    """Add to the sections of a scene the size and light of its pictures, and the pose of the camera of a depth map."""
     render, depth = data.get("render", {}), _get(data, "sheet", "surface", "depth")
     if not isinstance(render, Mapping):
         return data

@@ -39,7 +39,9 @@ CAMERAS: dict[str, dict[str, Any]] = {
 
 def depth_map(camera: dict[str, Any]) -> Array:
     """Depth [m] of a tilted plane with waves at all pixels of a camera, shape (height, width)."""
-    view = pinhole_view(Camera(**camera, pose=POSE_AT_ORIGIN), SIZE, extrinsics(Camera(**camera, pose=POSE_AT_ORIGIN), 0.0), 0.0)
+    view = pinhole_view(
+        Camera(**camera, pose=POSE_AT_ORIGIN), SIZE, extrinsics(Camera(**camera, pose=POSE_AT_ORIGIN), 0.0), 0.0
+    )
     pixels = np.stack(np.meshgrid(np.arange(WIDTH) + 0.5, np.arange(HEIGHT) + 0.5), axis=-1)
     x, y = np.moveaxis((view.undistort(pixels) - view.centre) / view.scale, -1, 0)
     depth = np.full(x.shape, 0.06)
