@@ -16,7 +16,7 @@ LAYERS = [
     {"dual", "system"},
     {"images", "integrators", "laws", "lenses", "shapes"},
     {"array_files"},
-    {"camera_files"},
+    {"camera_files", "surfaces"},
     {"scene"},
     {"model"},
     {"terms"},

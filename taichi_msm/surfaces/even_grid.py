@@ -72,9 +72,7 @@ def _minimise(surface: Surface, start: Array, progress: Callable[[int], None]) -
     objective = GridObjective(surface, start.shape[:2])
     if not np.isfinite(objective(start)[0]):
         raise FoldedGridError(_smallest_corner(positions(surface, start), start))
-    return minimise(
-        objective, start, _inverse_hessian(surface, objective, start), TOLERANCE, MAX_ITERATIONS, progress
-    )
+    return minimise(objective, start, _inverse_hessian(surface, objective, start), TOLERANCE, MAX_ITERATIONS, progress)
 
 
 def _smallest_corner(x: Array, p: Array) -> tuple[float, float]:

@@ -11,8 +11,6 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Callable
 
-import numpy as np
-
 from taichi_msm.arithmetic import Array
 
 # Number of steps that the Hessian is estimated from.

@@ -1,7 +1,7 @@
 """Not-a-knot cubic splines through values on an even grid, in two variables.
 
-On an even grid such a spline is a sum of uniform B-splines: with values s and second derivatives s'' at the knots, their
-coefficients are c = s - s'' / 6, and c[-1] = s''[0] + 2 c[0] - c[1] beyond the end. Its outermost pieces continue it.
+Such a spline is a sum of uniform B-splines: with values s and second derivatives s'' at the knots, their coefficients
+are c = s - s'' / 6, and c[-1] = s''[0] + 2 c[0] - c[1] beyond the end. Its outermost pieces continue it.
 """
 
 from __future__ import annotations
@@ -21,8 +21,7 @@ class GridSpline:
     def __call__(self, row: Array, column: Array) -> tuple[Array, Array, Array]:
         """Return values and their derivatives by row and by column, shape (k, ...) each, at k places."""
         i, j = (
-            np.clip(np.floor(at).astype(int), 0, count - 2)
-            for at, count in zip((row, column), self.shape, strict=True)
+            np.clip(np.floor(at).astype(int), 0, count - 2) for at, count in zip((row, column), self.shape, strict=True)
         )
         four = np.arange(4)
         near = self._coefficients[(i[:, None] + four)[:, :, None], (j[:, None] + four)[:, None, :]]
