@@ -87,11 +87,13 @@ def test_single_pixel_stays() -> None:
     assert np.abs(smooth[34:37, 44:47] / e[35, 45] - 1).max() < 0.1
 
 
-def test_pixels_in_a_line_have_their_mean() -> None:
-    """Without a plane through them, they continue by their mean: here the one value."""
-    is_known = np.zeros((30, 40), bool)
+def test_pixels_in_a_line_are_level_across() -> None:
+    """They have no slope across: rows are alike, and the mean is theirs."""
+    e, is_known = np.random.default_rng(3).random((30, 40)), np.zeros((30, 40), bool)
     is_known[7, 5:9] = True
-    assert smooth_inverse_depth(np.full((30, 40), 3.0), is_known, X[:30, :40], Y[:30, :40], 2.0) == pytest.approx(3.0)
+    smooth = smooth_inverse_depth(e, is_known, X[:30, :40], Y[:30, :40], 2.0)
+    assert np.ptp(smooth, axis=0).max() < 1e-9
+    assert smooth[:, 5:9].mean() == pytest.approx(e[7, 5:9].mean(), rel=1e-2)  # by nearly equal weights
 
 
 @pytest.mark.parametrize("deviation", [0.5, 3.0, 40.0])
