@@ -18,6 +18,7 @@ LAYERS = [
     {"array_files"},
     {"camera_files", "surfaces"},
     {"scene"},
+    {"cameras"},
     {"model"},
     {"terms"},
     {"solver"},
