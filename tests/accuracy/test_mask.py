@@ -14,6 +14,7 @@ from taichi_msm.accuracy.companions import QUASISTATIC_REASON, choose_companion_
 from taichi_msm.accuracy.interpolation import difference, same_outline
 from taichi_msm.accuracy.mesh import (
     NO_COARSER_MESH,
+    WRINKLING,
     MeshCompanion,
     MeshEstimate,
     choose_points,
@@ -144,7 +145,7 @@ def test_outline_with_fewer_points(name: str) -> None:
 def test_no_coarser_mesh_without_cells(surface: Any) -> None:
     """A cross narrower than two cells is between the middles of cells twice as long, but not of 11 cells a side."""
     cross = (abs(X - 0.5) < 1 / 30) | (abs(Y - 0.5) < 1 / 30)
-    plan = plan_of(pressed(masked(cross, (25, 25), surface=surface), force(0.5, 0.5, -0.1), REST))
+    plan = plan_of(pressed(masked(cross, (25, 25), surface=surface), BALL, REST))
     assert coarser_plan(plan) is None
     assert coarser_plan(plan_variant(plan, with_points(plan.scene, (23, 23)))) is not None
 
@@ -215,8 +216,8 @@ def test_estimate_by_the_differences(differences: list[float], error: float, dou
 def test_doubts_of_an_outline(device: Device, message: Messages) -> None:
     """A slit that coarse meshes close, and a tool with one companion run alone."""
     narrow = (abs(X - 0.5 + 1 / 48) > 1 / 48) | (abs(Y - 0.5) > 0.25)
-    plan = plan_of(pressed(masked(narrow), force(0.55, 0.5, -0.1), REST))
-    slit = estimate_mesh_error(plan, device, lambda done, total: None)
+    slit_plan = plan_of(pressed(masked(narrow), force(0.55, 0.5, -0.1), REST))
+    slit = estimate_mesh_error(slit_plan, device, lambda done, total: None)
     plan = plan_of(pressed(masked(HOLE), BALL, REST))
     coarse = mesh_companion_plan(plan)
     assert coarse is not None
@@ -230,6 +231,8 @@ def test_doubts_of_an_outline(device: Device, message: Messages) -> None:
     for doubt in (slit.doubt, alone.doubt):
         errors = RunErrorEstimates(reason=QUASISTATIC_REASON, mesh=MeshEstimate(0.004, doubt))
         message(list(run_warnings(plan, probe_records(plan.scene), MOVED, errors)), "the mesh error may be larger")
+    errors = RunErrorEstimates(reason=QUASISTATIC_REASON, mesh=MeshEstimate(0.02, WRINKLING))
+    message(list(run_warnings(slit_plan, probe_records(slit_plan.scene), MOVED, errors)), "hold the outline")
 
 
 def test_points_of_a_tolerance(device: Device) -> None:
