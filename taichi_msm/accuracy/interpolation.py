@@ -104,7 +104,7 @@ def _masked_weights(mask: Mask, other: Mask) -> tuple[NDArray[np.bool_], csr_arr
 
 def _shifted_points(mask: Mask) -> Array:
     """Return row and column of each mass point, moved a little into its own cells, shape (rows, cols, 2)."""
-    points, middles = (np.stack(np.indices(each.shape), axis=-1) for each in (mask.points, mask.cells))
+    points, middles = (np.moveaxis(np.indices(each.shape), 0, -1) for each in (mask.points, mask.cells))
     inside = sum_around_points((middles + 0.5) * mask.cells[..., None]) / np.maximum(mask.cell_counts, 1)[..., None]
     return np.asarray(points + TOWARDS_INSIDE * (inside - points))
 

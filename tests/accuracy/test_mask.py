@@ -191,7 +191,7 @@ SLOW = "moving", "tube"
 
 @pytest.mark.parametrize("name", [pytest.param(name, marks=pytest.mark.slow if name in SLOW else []) for name in CASES])
 def test_estimate_against_the_true_error(name: str, device: Device) -> None:
-    """0.67 to 8 times the error: of 70 scenes outside this test XXX."""
+    """0.67 to 8 times the error: of 142 random scenes outside this test, 1 was below and 6 above."""
     sheet, probe, time, tissue = CASES[name]
     estimates, error, force_error = estimates_and_errors(pressed(masked(HOLE, **sheet), probe, time, **tissue), device)
     assert 0.67 * error < estimates.mesh.error < 8 * error
