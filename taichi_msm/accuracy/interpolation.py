@@ -85,7 +85,7 @@ def _masked_weights(mask: Mask, other: Mask) -> tuple[NDArray[np.bool_], csr_arr
     rows, cols, weights = [], [], []
     remaining, shape = np.ones(len(places), bool), other.points.shape
     for count in (4, 3, 2):
-        squares = sliding_window_view(other.cells, (count - 1, count - 1)).all(axis=(2, 3))
+        squares = np.all(sliding_window_view(other.cells, (count - 1, count - 1)), axis=(2, 3))
         # Rows and columns of cells in the square before that of the place, the most central ones first.
         befores = product(range(count - 1), repeat=2)
         for before in sorted(befores, key=lambda pair: math.hypot(pair[0] - count / 2 + 1, pair[1] - count / 2 + 1)):
