@@ -2,7 +2,7 @@
 
     PYTHONPATH=. python docs/make_outline.py
 
-Takes about a minute.
+Takes some seconds.
 """
 
 from __future__ import annotations

@@ -12,6 +12,9 @@ from numpy.typing import NDArray
 from taichi_msm.arithmetic import Array
 from taichi_msm.model.cells import sum_around_points
 
+# A middle of a cell between two pixels, up to rounding, takes the right or lower one [px].
+TIE = 1e-6
+
 
 @dataclass(frozen=True, eq=False)
 class Mask:
@@ -23,8 +26,8 @@ class Mask:
     def sample(cls, is_sheet: NDArray[np.bool_], across: Array, down: Array) -> Mask:
         """Sample pixels at the middle of cells, fractions of the picture from left and top, by the nearest pixel."""
         height, width = is_sheet.shape
-        column = np.clip((across * width).astype(int), 0, width - 1)
-        row = np.clip((down * height).astype(int), 0, height - 1)
+        column = np.clip((across * width + TIE).astype(int), 0, width - 1)
+        row = np.clip((down * height + TIE).astype(int), 0, height - 1)
         return cls(is_sheet[row, column])
 
     @classmethod
