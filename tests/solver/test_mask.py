@@ -11,10 +11,12 @@ import pytest
 from numpy.typing import NDArray
 from PIL import Image
 
+from taichi_msm import FilesError, resume, run
 from taichi_msm.model.mask import Mask
 from taichi_msm.model.rest import CurvedRest, rest_of
 from taichi_msm.scene.scene import Scene
 from taichi_msm.scene.sheet import Sheet, SheetMask
+from taichi_msm.solver import dynamics as dynamics_module
 from taichi_msm.solver.arrays import SheetLayout
 from taichi_msm.solver.dynamics import Dynamics
 from taichi_msm.solver.planning import make_plan
@@ -26,10 +28,12 @@ from taichi_msm.terms.contact_rest import touched_points
 from taichi_msm.terms.elasticity import energy_density
 from taichi_msm.terms.springs import assemble_springs
 from tests import reference
+from tests.outputs import results as outcomes
 from tests.reference import surface
 from tests.reference.loads import frame_loads
 from tests.reference.mask import cell_counts, held_points, present_cells
 from tests.reference.sheet import highest_frequency as twin_frequency
+from tests.runs.test_resume import interrupted
 from tests.scenes import random_tissue, speckle
 from tests.solver.test_dynamics import as_on_a_gpu
 from tests.solver.test_same_bits import states
@@ -345,3 +349,25 @@ def test_random_masks_match_twin(seed: int, device: Device) -> None:
     layout = choose_layout(plan, device)
     gathered = replace(layout, workers=0, config=replace(layout.config, lanes=1))
     np.testing.assert_allclose(frames(made, device, gathered), expected, rtol=0, atol=atol)
+
+
+@pytest.mark.slow
+def test_interrupted_run_with_a_mask(device: Device, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """It resumes with the bits of an uninterrupted one, and restarts with another mask."""
+    monkeypatch.setattr(dynamics_module, "MAX_STEPS_PER_LAUNCH", 300)
+    time = {"frames_per_second": 100, "step": 1e-5}
+    made = scene_of("tense, maps, relaxing", **time).model_copy(update={"output": ("trajectory",)})
+    run(made, "whole", threads=device.threads, estimate_error=False)
+    with np.load("whole/trajectory.npz") as whole:
+        absent = cell_counts(present_cells(made.sheet)) == 0
+        assert (whole["position"][:, absent] == whole["position"][0, absent]).all()
+    interrupted(made, "parts", device)
+    assert resume("parts", threads=device.threads)["resumed"] > 0
+    assert outcomes(tmp_path / "parts") == outcomes(tmp_path / "whole")
+    interrupted(made, "parts", device)
+    write_mask(["#" * 14] * 13)
+    with pytest.raises(FilesError, match="mask"):
+        resume("parts", threads=device.threads)
+    # As another process reads the file.
+    made = scene_of("tense, maps, relaxing", **time).model_copy(update={"output": ("trajectory",)})
+    assert run(made, "parts", threads=device.threads, estimate_error=False)["resumed"] == 0
