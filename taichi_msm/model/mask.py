@@ -17,6 +17,9 @@ from taichi_msm.model.cells import sum_around_points
 # Places this close to an edge of a cell, in sides of a cell, are on it.
 EDGE_TOLERANCE = 1e-9
 
+# A middle of a cell between two pixels, up to rounding, takes the right or lower one [px].
+TIE = 1e-6
+
 
 @dataclass(frozen=True, eq=False)
 class Mask:
@@ -28,8 +31,8 @@ class Mask:
     def sample(cls, is_sheet: NDArray[np.bool_], across: Array, down: Array) -> Mask:
         """Sample pixels at the middle of cells, fractions of the picture from left and top, by the nearest pixel."""
         height, width = is_sheet.shape
-        column = np.clip((across * width).astype(int), 0, width - 1)
-        row = np.clip((down * height).astype(int), 0, height - 1)
+        column = np.clip((across * width + TIE).astype(int), 0, width - 1)
+        row = np.clip((down * height + TIE).astype(int), 0, height - 1)
         return cls(is_sheet[row, column])
 
     @classmethod
