@@ -18,7 +18,7 @@ from taichi_msm.accuracy.contact_warnings import _stiffnesses, first_piercing_pr
 from taichi_msm.accuracy.divergence import displacement_bound
 from taichi_msm.accuracy.mask import mask_notes
 from taichi_msm.cli.main import main
-from taichi_msm.errors import SceneError
+from taichi_msm.errors import DivergedError, SceneError
 from taichi_msm.load.scene_file import load_plan
 from taichi_msm.model.mask import Mask
 from taichi_msm.model.plan import Plan
@@ -268,6 +268,13 @@ def test_parts_that_nothing_holds(message: Messages) -> None:
     message(list(mask_notes(clamped)), "row 0, column 22")
     for held in (plan_of(), plan_of(tissue__foundation=1e6, sheet__fixed=["left"])):
         assert list(mask_notes(held)) == []
+
+
+def test_a_force_on_a_loose_part_at_rest(message: Messages) -> None:
+    split()
+    simulation = Simulation(plan_of(sheet__fixed=["left"], probes=[push([0.8, 0.5])], time__motion="quasistatic").scene)
+    with message.raises(DivergedError, "nothing holds a part of the sheet", hide=r"after .* point \(\d+, \d+\)"):
+        simulation.advance(5)
 
 
 def test_mean_stiffness_of_the_sheet() -> None:
