@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +15,7 @@ from PIL import Image
 from taichi_msm import FilesError, resume, run
 from taichi_msm.model.mask import Mask
 from taichi_msm.model.rest import CurvedRest, rest_of
+from taichi_msm.model.tool_force import control_point
 from taichi_msm.scene.scene import Scene
 from taichi_msm.scene.sheet import Sheet, SheetMask
 from taichi_msm.solver import dynamics as dynamics_module
@@ -66,8 +68,8 @@ MAPS: Any = {
 TUBE = {"tube": {"radius": 0.04, "folds": {"depth": 0.004, "spacing": 0.03}}}
 LOADS: Any = [
     {"at": [0.45, 0.6], "total": -0.6, "radius": 0.01, "load": [[0, 0], [0.05, 100]]},
-    {"at": [[0, 0.1, 0.2], [0.1, 0.9, 0.9]], "total": [0.1, 0.2, 0.3], "radius": 0.01, "load": [[0, 100]]},
-    {"at": [0.25, 0.25], "total": [0.1, 0, 0.3], "radius": 0.02},
+    {"at": [[0, 0.9, 0.2], [0.1, 0.85, 0.65]], "total": [0.1, 0.2, 0.3], "radius": 0.01, "load": [[0, 100]]},
+    {"at": [0.1, 0.3], "total": [0.1, 0, 0.3], "radius": 0.02},
 ]
 BALL: Any = {
     "path": [[0, 0.3, 0.3, 0.002], [0.04, 0.3, 0.3, -0.004], [0.1, 0.5, 0.5, -0.005]],
@@ -323,9 +325,17 @@ def test_rectangle_of_a_mask_is_a_smaller_sheet(fixed: str, device: Device) -> N
     np.testing.assert_allclose(frames(large, device)[:, 3:9, 4:11], u, rtol=0, atol=1e-12 * np.abs(u).max())
 
 
-def random_cells(seed: int, rows: int, cols: int) -> NDArray[np.bool_]:
-    """Two thirds of the cells at random; of two parts that meet at a point one cell more is sheet."""
+def random_cells(seed: int, scene: Scene) -> NDArray[np.bool_]:
+    """Two thirds of the cells at random, and those under force-controlled tools.
+
+    Of two parts that meet at a point, one cell more is sheet.
+    """
+    rows, cols = (count - 1 for count in scene.sheet.points)
     cells = np.random.default_rng(seed).random((rows, cols)) < 2 / 3
+    for probe, time in product(scene.probes, np.linspace(0, scene.time.duration, 400)):
+        if not probe.moved:
+            across, down = rest_of(scene.sheet).fractions(control_point(probe, scene.sheet, time))
+            cells[int(down * rows), int(across * cols)] = True
     while pinched := next(Mask(cells).pinched_points(), None):
         cells[pinched[0] - 1, pinched[1]] = cells[pinched] = True
     return cells
@@ -336,8 +346,7 @@ def random_cells(seed: int, rows: int, cols: int) -> NDArray[np.bool_]:
 def test_random_masks_match_twin(seed: int, device: Device) -> None:
     """Tissues of `random_tissue`, whose sides are free or fixed, with a border fixed as an outline."""
     made = random_tissue(seed, "map.png")
-    rows, cols = made.sheet.points
-    write_mask(["".join("#" if cell else "." for cell in row) for row in random_cells(seed, rows - 1, cols - 1)])
+    write_mask(["".join("#" if cell else "." for cell in row) for row in random_cells(seed, made)])
     fixed = "outline" if made.sheet.fixed == "border" else made.sheet.fixed
     sheet = made.sheet.model_copy(update={"mask": SheetMask(image="mask.png"), "fixed": fixed})
     made = made.model_copy(update={"sheet": sheet})
