@@ -13,8 +13,9 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from taichi_msm import FilesError, resume, run
+from taichi_msm.model.geometry import CurvedRest
 from taichi_msm.model.mask import Mask
-from taichi_msm.model.rest import CurvedRest, rest_of
+from taichi_msm.model.rest import rest_of
 from taichi_msm.model.tool_force import control_point
 from taichi_msm.scene.scene import Scene
 from taichi_msm.scene.sheet import Sheet, SheetMask
