@@ -1,4 +1,6 @@
-"""Objective of an even grid: the mean over the four corners of all cells of
+"""Objective of an even grid.
+
+It is the smallest mean, over r > 0, of a number of the four corners of all cells,
 
     (E / r + G r) / (2 A) + 0.01 (A / Am + Am / A)
 
@@ -6,7 +8,7 @@ E and G are the squares of the corner's two sides, across and down, A is the are
 and Am the mean area of the cells of the grid p = (u, v). The first term is 1 where all cells are rectangles of the
 aspect r, larger elsewhere, and infinite where A is 0. With e and g, the means of E / A and G / A, the best r is
 (e / g)^(1/2), and the mean of the first term (e g)^(1/2).
-"""  # noqa: D415
+"""
 
 from __future__ import annotations
 

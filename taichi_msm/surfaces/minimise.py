@@ -1,7 +1,7 @@
 """Minimisation by L-BFGS, with an approximate inverse Hessian to begin from, over a domain with an end.
 
-SciPy's takes neither: its line search expects finite values, and its first Hessian is a multiple of the identity, with
-which the iterations grow with the number of unknowns.
+SciPy's takes neither: its line search expects finite values, and its first Hessian is a multiple of the identity. With
+that one, an even grid of 101 x 101 mass points takes 360 to 1000 iterations, in place of 25 to 54.
 
 Source: Nocedal, Wright: Numerical Optimization, 2nd ed., algorithms 3.1 and 7.4.
 """

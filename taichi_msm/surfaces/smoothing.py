@@ -19,9 +19,9 @@ TRUNCATION = 8.0
 # Least sum of the weights ok G; with less, G becomes twice as wide.
 MIN_WEIGHT = 1e-3
 
-# Least determinant of the covariance of x and y [px^4], over the variance of G [px^2]: pixels in a line have 0, two
-# neighbouring rows 1/4.
-MIN_DETERMINANT = 1e-6
+# Least determinant of the covariance of x and y [px^4], over the variance of G and its square: pixels in a line have 0,
+# two neighbouring rows 1/4 of the variance. The mean of the pixels is the fit within a distance from their centre [px].
+MIN_DETERMINANT, MAX_OFFSET = 1e-6, 1e-6
 
 # Rows of a block of a filter.
 BLOCK_ROWS = 128
@@ -30,8 +30,8 @@ BLOCK_ROWS = 128
 def smooth_inverse_depth(inverse: Array, is_known: NDArray[np.bool_], x: Array, y: Array, deviation: float) -> Array:
     """Return e_s for e = `inverse`, shape (h, w), at undistorted coordinates x, y of the pixels, in any unit.
 
-    G has the standard deviation `deviation` [px]; with 0, only pixels without depth change, by one of 1 px. At least one
-    pixel must be known.
+    G has the standard deviation `deviation` [px]; with 0, only pixels without depth change, by one of 1 px. At least
+    one pixel must be known.
     """
     is_kept = is_known & (deviation == 0)
     is_open = ~is_kept
@@ -40,8 +40,8 @@ def smooth_inverse_depth(inverse: Array, is_known: NDArray[np.bool_], x: Array, 
     whole = _plane(inverse, is_known, x, y)
     values = np.where(is_known, inverse - whole, 0.0)
     smooth = values.copy()
-    moments = known, known * x, known * y, known * x * x, known * x * y, known * y * y
-    moments += values, values * x, values * y
+    moments = [known, known * x, known * y, known * x * x, known * x * y, known * y * y]
+    moments += [values, values * x, values * y]
     deviation = deviation or 1.0
     while is_open.any():
         # Far from few pixels no width has the weight, and where all pixels are in a line none has a plane.
@@ -53,8 +53,9 @@ def smooth_inverse_depth(inverse: Array, is_known: NDArray[np.bool_], x: Array, 
         if is_near.any():
             gaussian = _Gaussian(deviation, is_known, is_near)
             at = gaussian.at
-            fit, is_plane = _fit_planes([gaussian.filter(each) for each in moments], x[at], y[at], deviation)
-            is_done = is_near[at] & (is_plane | is_last)
+            filtered = [gaussian.filter(each) for each in moments]
+            fit, is_determined = _fit_planes(filtered, x[at], y[at], gaussian.variance)
+            is_done = is_near[at] & (is_determined | is_last)
             smooth[at] = np.where(is_done, fit, smooth[at])
             is_open[at] &= ~is_done
         deviation *= 2
@@ -75,17 +76,22 @@ def _in_pixels(coordinate: Array, axis: int) -> Array:
     return (coordinate - (coordinate.max() + coordinate.min()) / 2) * (coordinate.shape[axis] / np.ptp(coordinate))
 
 
-def _fit_planes(moments: list[Array], x: Array, y: Array, deviation: float) -> tuple[Array, NDArray[np.bool_]]:
-    """Return the value at x, y [px] of the plane with the filtered moments, and whether they have one; else the mean."""
+def _fit_planes(moments: list[Array], x: Array, y: Array, variance: float) -> tuple[Array, NDArray[np.bool_]]:
+    """Return the values at x, y [px] of the planes with filtered moments, and whether they determine it; else the mean.
+
+    `variance` is that of the filter [px^2].
+    """
     weight = np.maximum(moments[0], np.finfo(float).tiny)
     mean_x, mean_y, xx, xy, yy, mean, x_value, y_value = (each / weight for each in moments[1:])
     # Covariances, and the plane through the means.
     xx, xy, yy = xx - mean_x * mean_x, xy - mean_x * mean_y, yy - mean_y * mean_y
     x_value, y_value = x_value - mean_x * mean, y_value - mean_y * mean
     determinant = xx * yy - xy * xy
-    is_plane = determinant > MIN_DETERMINANT * deviation**2
-    rise = (x_value * yy - y_value * xy) * (x - mean_x) + (y_value * xx - x_value * xy) * (y - mean_y)
-    return mean + np.divide(rise, determinant, out=np.zeros_like(rise), where=is_plane), is_plane
+    is_plane = determinant > MIN_DETERMINANT * variance * min(variance, 1)
+    d_x, d_y = x - mean_x, y - mean_y
+    rise = (x_value * yy - y_value * xy) * d_x + (y_value * xx - x_value * xy) * d_y
+    fit = mean + np.divide(rise, determinant, out=np.zeros_like(rise), where=is_plane)
+    return fit, is_plane | (np.hypot(d_x, d_y) < MAX_OFFSET)
 
 
 class _Gaussian:
@@ -99,6 +105,7 @@ class _Gaussian:
         radius = int(TRUNCATION * deviation + 0.5)
         weights = np.exp(-0.5 * (np.arange(radius + 1) / deviation) ** 2)
         weights /= 2 * weights.sum() - 1
+        self.variance = 2 * float((weights * np.arange(radius + 1) ** 2).sum())  # [px^2]
         self._blocks = []
         for other in (1, 0):
             first, last = np.flatnonzero(is_source.any(axis=other))[[0, -1]]

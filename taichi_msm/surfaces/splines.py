@@ -1,7 +1,7 @@
 """Not-a-knot cubic splines through values on an even grid, in two variables.
 
-On an even grid such a spline is a sum of uniform B-splines: with values s and second derivatives s'' at the knots, their
-coefficients are c = s - s'' / 6, and c[-1] = s''[0] + 2 c[0] - c[1] beyond the end. Its outermost pieces continue it.
+Such a spline is a sum of uniform B-splines: with values s and second derivatives s'' at the knots, their coefficients
+are c = s - s'' / 6, and c[-1] = s''[0] + 2 c[0] - c[1] beyond the end. Its outermost pieces continue it.
 """
 
 from __future__ import annotations

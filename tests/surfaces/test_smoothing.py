@@ -21,7 +21,7 @@ def with_holes(seed: int = 0) -> np.ndarray:
 
 
 def least_squares(e: Array, is_known: np.ndarray, x: Array, y: Array, deviation: float, at: tuple[int, int]) -> float:
-    """Value at a pixel of the plane that fits best with the weights ok G, G as wide as the contract of the page asks."""
+    """Value at a pixel of the plane that fits best with the weights ok G, twice as wide until they suffice."""
     down, across = (np.arange(count) - place for count, place in zip(e.shape, at, strict=True))
     while True:
         one, two = (
@@ -41,7 +41,7 @@ def least_squares(e: Array, is_known: np.ndarray, x: Array, y: Array, deviation:
     return float(np.linalg.lstsq(design / scale * root[:, None], root * e[used], rcond=None)[0][0])
 
 
-@pytest.mark.parametrize("deviation", [0.7, 3.0])
+@pytest.mark.parametrize("deviation", [0.1, 0.2, 0.7, 3.0])
 def test_fit_is_that_of_least_squares(deviation: float) -> None:
     # Coordinates as of a lens with distortion, and noise of a tenth.
     x, y = X * (1 + 0.2 * (X * X + Y * Y)), Y * (1 + 0.2 * (X * X + Y * Y))
@@ -53,7 +53,7 @@ def test_fit_is_that_of_least_squares(deviation: float) -> None:
         assert smooth[at] == pytest.approx(least_squares(e, is_known, x, y, deviation, at), rel=1e-10)
 
 
-@pytest.mark.parametrize("deviation", [0.0, 0.5, 4.0])
+@pytest.mark.parametrize("deviation", [0.0, 0.1, 0.5, 4.0])
 @pytest.mark.parametrize("degrees", [0, 40])
 def test_planes_stay_planes(deviation: float, degrees: float) -> None:
     e, is_known = plane(degrees, 0.7), with_holes()
@@ -77,11 +77,23 @@ def test_a_small_mask_fills_the_whole_picture() -> None:
     assert np.abs(smooth_inverse_depth(e, is_known, X, Y, 2.0) / e - 1).max() < 1e-8
 
 
-def test_pixels_in_a_line_have_their_mean() -> None:
-    """Without a plane through them, they continue by their mean: here the one value."""
-    is_known = np.zeros((30, 40), bool)
+def test_single_pixel_stays() -> None:
+    """The fit in the middle of its own hole is its depth, whatever the slope."""
+    e, is_known = folds(0.002, 0.02), np.ones(X.shape, bool)
+    is_known[20:50, 30:60] = False
+    is_known[35, 45] = True
+    smooth = smooth_inverse_depth(e, is_known, X, Y, 1.0)
+    assert smooth[35, 45] == pytest.approx(e[35, 45], rel=1e-12)
+    assert np.abs(smooth[34:37, 44:47] / e[35, 45] - 1).max() < 0.1
+
+
+def test_pixels_in_a_line_are_level_across() -> None:
+    """They have no slope across: rows are alike, and the mean is theirs."""
+    e, is_known = np.random.default_rng(3).random((30, 40)), np.zeros((30, 40), bool)
     is_known[7, 5:9] = True
-    assert smooth_inverse_depth(np.full((30, 40), 3.0), is_known, X[:30, :40], Y[:30, :40], 2.0) == pytest.approx(3.0)
+    smooth = smooth_inverse_depth(e, is_known, X[:30, :40], Y[:30, :40], 2.0)
+    assert np.ptp(smooth, axis=0).max() < 1e-9
+    assert smooth[:, 5:9].mean() == pytest.approx(e[7, 5:9].mean(), rel=1e-2)  # by nearly equal weights
 
 
 @pytest.mark.parametrize("deviation", [0.5, 3.0, 40.0])
