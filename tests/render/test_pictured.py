@@ -194,7 +194,7 @@ def twin_light(made: Scene, buffer: GBuffer, position: Array, camera: View) -> A
 @pytest.mark.parametrize("lens", CAMERAS)
 def test_deformed_sheet_from_another_camera_matches_the_twin(lens: str, shading: str, device: Device) -> None:
     made = seen_aside(CAMERAS[lens], shading=shading, size=[112, 84])
-    position, camera, texture = dented(made), view(made), np.full((HEIGHT, WIDTH, 3), 120, np.uint8)
+    position, camera, texture = dented(made), view(made), np.full((HEIGHT, WIDTH, 3), 240, np.uint8)
     if shading == "none":
         texture = load_texture(made)
     frame = Rasterizer(made, texture).draw(position)
@@ -210,7 +210,8 @@ def test_deformed_sheet_from_another_camera_matches_the_twin(lens: str, shading:
         reference = _bilinear(lit, np.nan_to_num(across), np.nan_to_num(down))
         ratio = np.minimum(twin_light(made, buffer, position, camera) / reference, 4)
         colour = np.minimum(colour * ratio[..., None], 255)
-        assert np.ptp(ratio[covered]) > 0.2
+        assert (colour[covered] == 255).any()
+        assert ratio[covered].min() < 0.8
     difference = np.abs(frame - np.floor(colour + 0.5))[covered].max(axis=-1)
     # The silhouette moves past few pixel centres, as in `assert_picture_matches_twin`.
     assert (difference > 1).mean() < 0.01
