@@ -157,6 +157,14 @@ def test_frame_at_rest_of_half_the_size_is_the_reduced_picture(device: Device) -
     np.testing.assert_allclose(draw_at_rest(made), mean, rtol=0, atol=1)
 
 
+def test_small_motion_with_a_relief_changes_little(device: Device) -> None:
+    """By 0.005 px the bilinear picture changes by at most a level or two; the slope of the relief must not jump."""
+    made, shift = pictured(render={"shading": "tissue", "light": {"relief": 1}}), np.array([5e-3 / 80 * 0.06, 0, 0])
+    rasterizer = Rasterizer(made, load_texture(made))
+    moved = rasterizer.draw(rest_of(made.sheet).position + shift)
+    assert np.abs(moved.astype(int) - load_texture(made))[1:-1, 1:-1].max() <= 3
+
+
 def test_gloss_is_in_the_picture() -> None:
     assert pictured().render.light.gloss == 0
     assert pictured(render={"light": {"gloss": 0.3}}).render.light.gloss == 0.3
