@@ -36,6 +36,9 @@ MAX_BYTES = 2**31
 # Path of the copy that is read in place of a file, by path of the file.
 _copies: Mapping[str, Path] = {}
 
+# Folder to which other paths are relative.
+_folder = Path()
+
 
 class PictureError(Exception):
     """A file cannot be used as a picture."""
@@ -57,6 +60,17 @@ def use_copies(copies: Mapping[str, Path]) -> Iterator[None]:
         yield
     finally:
         _copies = previous
+
+
+@contextmanager
+def use_folder(folder: str | Path) -> Iterator[None]:
+    """Let paths of files be relative to a folder within the block."""
+    global _folder
+    previous, _folder = _folder, Path(folder)
+    try:
+        yield
+    finally:
+        _folder = previous
 
 
 def read_rgb(path: str, background: tuple[int, int, int], sha256: str | None = None) -> Image.Image:
@@ -210,8 +224,8 @@ def irregular_kind(path: Path) -> str:
 
 
 def actual_path(path: str) -> Path:
-    """Return the path to read: the path itself, or that of its copy within `use_copies`."""
-    return _copies.get(path) or Path(path)
+    """Return the path to read: within `use_copies` that of its copy, within `use_folder` that in the folder."""
+    return _copies.get(path) or _folder / path
 
 
 def _require_file(path: str) -> None:
