@@ -42,7 +42,11 @@ def kept_grid(surface: Surface, frame: Frame, points: tuple[int, int], key: tupl
         return grid
     places = (np.linspace(0, count - 1, n) for count, n in zip(own, points, strict=True))
     row, column = np.meshgrid(*places, indexing="ij")
-    return GridSpline(grid)(row.ravel(), column.ravel())[0].reshape(*points, 2)
+    interpolated = GridSpline(grid)(row.ravel(), column.ravel())[0].reshape(*points, 2)
+    # Rounding may move points off the sides of the picture.
+    interpolated[:, 0, 0] = interpolated[0, :, 1] = 0
+    interpolated[:, -1, 0] = interpolated[-1, :, 1] = 1
+    return interpolated
 
 
 def _read_or_compute(surface: Surface, points: tuple[int, int], digest: str) -> Array:

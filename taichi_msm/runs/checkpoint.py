@@ -154,7 +154,7 @@ def _frozen_sheet(sheet: Sheet, archive: zipfile.ZipFile) -> Sheet:
     grid = None
     if sheet.surface and sheet.surface.is_even:
         grid = read_array(archive, "grid", np.dtype(np.float64), (*sheet.points, 2))
-        if not ((grid >= 0) & (grid <= 1)).all():
+        if not np.isfinite(grid).all():
             raise ValueError("grid")
     return sheet.with_frozen_surface(None, None if grid is None else KeptGrid.of(grid))
 

@@ -118,8 +118,7 @@ class FinishedRun:
                 fault = entry_kind(path) or "no such file"
                 raise FilesError(f"{path}: {fault}; restore it, or run the scene again")
             grid = np.array(map_array(path, "grid", np.float64, (*sheet.points, 2)))
-        # NaN fails this comparison.
-        if not ((grid >= 0) & (grid <= 1)).all():
+        if not np.isfinite(grid).all():
             raise damaged_result(path)
         return sheet.with_frozen_surface(None, KeptGrid.of(grid))
 

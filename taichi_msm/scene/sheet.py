@@ -215,9 +215,9 @@ class Sheet(Section):
         surface = self.surface
         if surface is None or surface.frame is None:
             return self
+        frame = surface.frame._replace(points=self.points, is_kept=True, grid=grid)
         if surface.depth and smooth is not None:
             surface = surface.model_copy(update={"depth": surface.depth.model_copy(update={"smooth": smooth})})
-        frame = surface.frame._replace(points=self.points, is_kept=True, grid=grid)
         return self.model_copy(update={"surface": surface.with_frame(frame)})
 
     @property

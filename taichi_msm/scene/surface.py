@@ -299,7 +299,8 @@ class RestSurface(Section):
         section = self._file_section
         if section is None:
             return self
-        return self.model_copy(update={self.kind: section.model_copy(update={"file": path(section.file)})})
+        changed = self.model_copy(update={self.kind: section.model_copy(update={"file": path(section.file)})})
+        return changed.with_frame(self.frame)
 
     @model_validator(mode="after")
     def _check_one_kind(self) -> Self:

@@ -117,7 +117,7 @@ def test_run_continues_an_unfinished_one(depth: Path, device: Device) -> None:
 
 def test_chosen_mesh(depth: Path, device: Device, monkeypatch: pytest.MonkeyPatch) -> None:
     """A mesh for a tolerance keeps smoothing and grid of the scene's own points, also when it is read again."""
-    tolerance = {"sheet.tolerance": 0.05, "probes.0.radius": 0.02, "probes.0.falloff": 100.0}
+    tolerance = {"sheet.tolerance": 0.1, "tissue.pretension": 50.0, "time.duration": 0.1}
     made = load_scene("scene.yaml", tolerance)
     own = rest_of(made.sheet)
     assert isinstance(own, PicturedRest)
