@@ -53,7 +53,8 @@ def _read_or_compute(surface: Surface, points: tuple[int, int], digest: str) -> 
     """Return a grid from the user's folder, without which it is computed and stored there."""
     path = user_folder() / f"{digest}.npz"
     with suppress(Exception):  # a damaged file may raise any type
-        with np.load(path, allow_pickle=False) as archive:
+        # NumPy would leave a damaged file open.
+        with path.open("rb") as file, np.load(file, allow_pickle=False) as archive:
             grid = archive["grid"]
         if grid.shape == (*points, 2) and grid.dtype == np.float64:
             path.touch()

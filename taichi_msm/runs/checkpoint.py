@@ -296,7 +296,7 @@ class Checkpoint:
         try:
             with self._state_path.open("rb") as file, zipfile.ZipFile(file) as archive:
                 self._manifest = _manifest_bytes(archive)
-                if "steps.npy" not in archive.namelist():
+                if len(archive.namelist()) == 1 + len(self._grid):  # without a state
                     return None
                 arrays = {name: read_array(archive, name, array.dtype, array.shape) for name, array in expected.items()}
         except FileNotFoundError:
