@@ -146,7 +146,7 @@ class DepthMap(Section):
                 "(h, w) or (h, w, 3)",
             )
             values = values[..., 2] if values.ndim == 3 else values
-        return ArrayFile(values, sha256, self.metres * quantum(values))
+        return ArrayFile(values, sha256, 0.0)
 
     @property
     def metres(self) -> float:
