@@ -107,6 +107,7 @@ def read_depth(path: str, sha256: str | None = None) -> NDArray[Any]:
     from PIL import ImageOps
 
     with _open(path, sha256, (*_MODES_16_BIT, "L", "F")) as opened:
+        require_memory(path, DECODING_BYTES * opened.width * opened.height, "scale it down")
         image = ImageOps.exif_transpose(opened)
         return np.asarray(image).astype(np.uint16) if image.mode in _MODES_16_BIT else np.asarray(image)
 
@@ -152,6 +153,7 @@ def _open(path: str, sha256: str | None = None, modes: Sequence[str] = _MODES) -
     from PIL import Image, UnidentifiedImageError
 
     _require_file(path)
+    is_colour, one_channel = modes == _MODES, "save one number a pixel, or an .npy array"
     # libtiff and Pillow also print the errors that they raise.
     with discarded_output(2), warnings.catch_warnings():
         warnings.simplefilter("ignore")
@@ -175,13 +177,14 @@ def _open(path: str, sha256: str | None = None, modes: Sequence[str] = _MODES) -
                     if scans > limit:
                         raise PictureError(f"{path} has {scans} scans, more than {limit}", "save it again")
                 if image.mode not in modes:
-                    remedy = "save it as 8-bit RGB" if modes == _MODES else "save one number a pixel, or an .npy array"
+                    remedy = "save it as 8-bit RGB" if is_colour else one_channel
                     raise PictureError(f"{path} has pixels of kind {image.mode}", remedy)
                 yield image
         except PictureError:
             raise
         except UnidentifiedImageError:
-            raise PictureError(f"{path} is not a PNG, JPEG, WebP, BMP or TIFF picture", "convert it") from None
+            remedy = "convert it" if is_colour else one_channel
+            raise PictureError(f"{path} is not a PNG, JPEG, WebP, BMP or TIFF picture", remedy) from None
         except (Image.DecompressionBombWarning, Image.DecompressionBombError):
             limit = (Image.MAX_IMAGE_PIXELS or 0) // 10**6
             raise PictureError(f"{path} has more than {limit} million pixels", "scale it down") from None

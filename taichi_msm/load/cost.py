@@ -22,6 +22,7 @@ import numpy as np
 from taichi_msm.accuracy.companions import choose_companion_runs
 from taichi_msm.errors import Problem, SceneError
 from taichi_msm.images import DECODING_BYTES
+from taichi_msm.model.depth import DEPTH_PIXEL_BYTES
 from taichi_msm.model.plan import Plan
 from taichi_msm.model.time_grid import DTYPES
 from taichi_msm.render import texture
@@ -129,6 +130,8 @@ def estimate_budget(plan: Plan) -> Budget:
     surface = scene.sheet.surface
     surface_bytes = surface.file.values.nbytes if surface and surface.file else 0
     surface_bytes += CURVED_BYTES * points * (surface is not None)
+    if surface and surface.depth and surface.frame:
+        surface_bytes += DEPTH_PIXEL_BYTES * math.prod(surface.frame.region[2:])
     mask_bytes = scene.sheet.mask.pixels.is_sheet.nbytes if scene.sheet.mask else 0
     memory_numbers, has_grid = len(memory_names(plan)), surface is not None and surface.is_even
     numbers = STATE_NUMBERS + OUTPUT_NUMBERS + memory_numbers + sum(MAP_NUMBERS[name] for name in scene.maps)

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from taichi_msm.arithmetic import Array
-from taichi_msm.images import PictureError
+from taichi_msm.images import PictureError, require_memory
 from taichi_msm.model.cells import Cells, unit
 from taichi_msm.model.geometry import Origin
 from taichi_msm.model.grids import kept_grid
@@ -23,6 +23,9 @@ from taichi_msm.system.array_cache import cached_arrays
 
 # Largest share of pixels without depth, and of steep cells, those seen at more than MAX_ANGLE [degrees].
 MAX_FILLED, MAX_STEEP, MAX_ANGLE = 0.25, 0.01, 80.0
+
+# Memory per pixel for smoothing and splines [bytes].
+DEPTH_PIXEL_BYTES = 450
 
 
 class Relief(NamedTuple):
@@ -54,6 +57,7 @@ def read_relief(section: DepthMap, frame: Frame, picture: Picture, mask: SheetMa
     if numbers.shape[1::-1] != frame.image_size:
         sizes = "{1} x {0}".format(*numbers.shape), "{} x {}".format(*frame.image_size)
         raise PictureError(f"{path} has {sizes[0]} pixels, and the image {sizes[1]}", "give the depth of every pixel")
+    require_memory(path, DEPTH_PIXEL_BYTES * width * height, "cut the region, or scale the picture down")
     known = depth_map.DepthMap.of(numbers[y : y + height, x : x + width], section.metres)
     centres = np.stack(np.meshgrid(np.arange(width) + 0.5, np.arange(height) + 0.5), axis=-1)
     corner = np.array([x, y], float)
