@@ -39,9 +39,10 @@ def change(*replacements: tuple[str, str]) -> str:
 DEPTH = "depth: {file: depth.npy, unit: mm}"
 LENS = "{intrinsics: {fx: 40, fy: 40, cx: 23.5, cy: 17.5}}"
 CAMERA = f"camera: {LENS}"
+SIZE = ("[9, 11]", "[9, 11]\n  size: [1, 1]")
 KEYS: dict[str, tuple[list[tuple[str, str]], str]] = {
-    "no unit": ([("file: depth.npy, unit: mm", "file: depth.npy")], "scene.yaml:5:5: sheet.surface.depth.unit: missing"),
-    "unknown unit": ([("unit: mm", "unit: inch")], "scene.yaml:5:38: sheet.surface.depth.unit:"),
+    "no unit": ([("depth.npy, unit: mm", "depth.npy")], "scene.yaml:5:5: sheet.surface.depth.unit: missing"),
+    "unknown unit": ([("unit: mm", "unit: inch")], "scene.yaml:5:30: sheet.surface.depth.unit:"),
     "no points": ([("  points: [9, 11]\n", "")], "sheet.points: missing"),
     "a size": ([("[9, 11]\n", "[9, 11]\n  size: [1, 1]\n")], "scene.yaml:4:3: sheet.size:"),
     "no image": ([("image: frame.png\n", "")], "sheet.surface.depth"),
@@ -58,7 +59,7 @@ KEYS: dict[str, tuple[list[tuple[str, str]], str]] = {
     "camera without a target": ([(LENS, "{eye: [0, 0, 1], fov: 40}")], "sheet.surface.depth"),
     "another camera": (
         [("unit: mm", "unit: mm, camera: right"), (CAMERA, f"cameras: {{left: {LENS}}}")],
-        "scene.yaml:5:47: sheet.surface.depth.camera: right",
+        "scene.yaml:5:40: sheet.surface.depth.camera: right",
     ),
     "name of an unnamed camera": ([("unit: mm", "unit: mm, camera: left")], "sheet.surface.depth.camera: left"),
     "second camera without a pose": (
@@ -68,8 +69,15 @@ KEYS: dict[str, tuple[list[tuple[str, str]], str]] = {
     "aspect of pictures": ([("render: {", "render: {size: [48, 48], ")], "render.size: 48 x 48"),
     "bending": ([("damping: 30", "damping: 30, bending: plate")], "tissue.bending:"),
     "picture": ([(DEPTH, f"{DEPTH}\n    picture: left")], "scene.yaml:6:5: sheet.surface.picture:"),
-    "picture of a dome": ([(DEPTH, "dome: {radius: 2}\n    picture: main"), ("[9, 11]", "[9, 11]\n  size: [1, 1]")], "sheet.surface.picture:"),
-    "grid of a tube": ([(DEPTH, "tube: {radius: 2}\n    grid: even"), ("[9, 11]", "[9, 11]\n  size: [1, 1]")], "sheet.surface.grid:"),
+    "picture of a dome": (
+        [(DEPTH, "dome: {radius: 2}\n    picture: main"), SIZE, (CAMERA, "camera: top")],
+        "scene.yaml:7:5: sheet.surface.picture:",
+    ),
+    "camera at the origin without a depth map": ([(DEPTH, "dome: {radius: 2}"), SIZE], "render.camera.eye: missing"),
+    "grid of a tube": (
+        [(DEPTH, "tube: {radius: 2}\n    grid: even"), SIZE, (CAMERA, "camera: top")],
+        "scene.yaml:7:5: sheet.surface.grid:",
+    ),
     "grid": ([(DEPTH, f"{DEPTH}\n    grid: uneven")], "scene.yaml:6:5: sheet.surface.grid:"),
     "smooth": ([("unit: mm", "unit: mm, smooth: -1")], "sheet.surface.depth.smooth:"),
     "along": ([("unit: mm", "unit: mm, along: z")], "sheet.surface.depth.along:"),
@@ -79,7 +87,6 @@ KEYS: dict[str, tuple[list[tuple[str, str]], str]] = {
 
 @pytest.mark.parametrize("name", KEYS)
 def test_invalid_keys(name: str, depth: Path, message: Messages) -> None:
-    """One line with the place, unless the same key is faulty elsewhere."""
     replacements, place = KEYS[name]
     with message.raises(SceneError, place) as caught:
         load_scene(change(*replacements))
