@@ -76,7 +76,7 @@ def show_progress(interruption: Interruption, quiet: bool) -> Iterator[Callable[
     The callback raises a KeyboardInterrupt after an interruption, which is listened to from the first stage on.
     """
     from taichi_msm.cli.console import ProgressDisplay
-    from taichi_msm.model.grid_progress import report_grids
+    from taichi_msm.model.grids import report_grids
 
     def progress(stage: str, done: int, total: int) -> None:
         bar.update(stage, done, total)
@@ -92,7 +92,7 @@ def show_progress(interruption: Interruption, quiet: bool) -> Iterator[Callable[
 @contextmanager
 def show_grids(quiet: bool) -> Iterator[None]:
     """Show the progress of even grids in the block, unless `show_progress` within it does."""
-    from taichi_msm.model.grid_progress import report_grids
+    from taichi_msm.model.grids import report_grids
 
     displays: list[ProgressDisplay] = []
 

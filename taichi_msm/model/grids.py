@@ -5,15 +5,17 @@ from __future__ import annotations
 import hashlib
 import os
 import sys
-from contextlib import suppress
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from contextvars import ContextVar
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from taichi_msm.arithmetic import Array
+from taichi_msm.errors import ProgressCallback
 from taichi_msm.images import PictureError
-from taichi_msm.model.grid_progress import grid_observer
 from taichi_msm.scene.surface import Frame
 from taichi_msm.surfaces.even_grid import FoldedGridError, even_grid
 from taichi_msm.surfaces.splines import GridSpline
@@ -25,6 +27,18 @@ MAX_FILES = 50
 
 # Changes with the method.
 VERSION = 1
+
+_progress: ContextVar[ProgressCallback | None] = ContextVar("progress", default=None)
+
+
+@contextmanager
+def report_grids(progress: ProgressCallback) -> Iterator[None]:
+    """Report the progress of even grids within the block, by the completed and the largest number of iterations."""
+    token = _progress.set(progress)
+    try:
+        yield
+    finally:
+        _progress.reset(token)
 
 
 def kept_grid(surface: Surface, frame: Frame, points: tuple[int, int], key: tuple[Any, ...]) -> Array:
@@ -60,7 +74,7 @@ def _read_or_compute(surface: Surface, points: tuple[int, int], digest: str) -> 
             path.touch()
             return grid
     try:
-        grid = even_grid(surface, points, grid_observer()).fractions
+        grid = even_grid(surface, points, _progress.get()).fractions
     except FoldedGridError as error:
         across, down = error.place
         place = f"{across:.3g} across and {down:.3g} down"

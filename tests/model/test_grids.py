@@ -10,8 +10,7 @@ import pytest
 from numpy.typing import NDArray
 
 from taichi_msm.model import grids
-from taichi_msm.model.grid_progress import report_grids
-from taichi_msm.model.grids import MAX_FILES, kept_grid, user_folder
+from taichi_msm.model.grids import MAX_FILES, kept_grid, report_grids, user_folder
 from taichi_msm.scene.surface import Frame
 from taichi_msm.surfaces.even_grid import EvenGrid
 from taichi_msm.surfaces.surface import Surface, given_grid, point_surface

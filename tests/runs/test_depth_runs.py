@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 from taichi_msm.accuracy.mesh import with_points
-from taichi_msm.errors import FilesError
+from taichi_msm.cli import console
+from taichi_msm.errors import FilesError, SceneError
+from taichi_msm.fitting.fit import fit
+from taichi_msm.gradients.gradient import gradient
 from taichi_msm.load.scene_file import load_scene
 from taichi_msm.model import grids, rest
 from taichi_msm.model.pictured import PicturedRest
@@ -16,13 +20,15 @@ from taichi_msm.model.rest import rest_of
 from taichi_msm.runs.finished import read_run
 from taichi_msm.runs.run import resume, run
 from taichi_msm.scene.scene import Scene
+from taichi_msm.sweeps.sweep import sweep
 from taichi_msm.system import array_cache
 from taichi_msm.system.runtime import Device
+from taichi_msm.view.recording import Captures
 from tests.conftest import Program
 from tests.depths import wall, write_depth_scene
 from tests.golden import Messages
 from tests.outputs import files, results
-from tests.runs.test_finished import record
+from tests.runs.test_finished import record, sha256
 from tests.runs.test_resume import interrupted
 
 
@@ -158,3 +164,57 @@ def test_other_meshes(depth: Path) -> None:
     np.testing.assert_allclose(coarse.position, own.position[::2, ::2], rtol=0, atol=1e-15)
     assert isinstance(coarse, PicturedRest)
     assert coarse.origin.deviation == (48 / 10 + 36 / 8) / 4
+
+
+def test_progress_of_the_grid(
+    depth: Path, program: Program, monkeypatch: pytest.MonkeyPatch, message: Messages
+) -> None:
+    """Lines on stderr of any command while a grid is minimised, but not with --json, and none for a kept grid."""
+    monkeypatch.setattr(console, "LINE_INTERVAL_S", 0.0)
+    for words, is_shown in ((("--json",), False), ((), False), (("--set", "sheet.points=[17, 21]"), True), ((), False)):
+        forget(monkeypatch)
+        done = program("check", "scene.yaml", *words)
+        assert done.returncode == 0
+        assert ("spreading mass points: 1000 of 2000 done" in done.stderr) == is_shown
+
+
+def test_fits_copy_the_depth_map(depth: Path, device: Device) -> None:
+    run(load_scene("scene.yaml", {"tissue.young": 3e4}), "truth", threads=device.threads, estimate_error=False)
+    with np.load("truth/trajectory.npz") as trajectory:
+        observed = dict(trajectory)
+    result = fit("scene.yaml", observed, ["tissue.young"], directory="fitted", workers=1)
+    assert abs(result.parameters["tissue.young"].value / 3e4 - 1) < 1e-4
+    for name in ("depth.npy", "frame.png"):
+        assert Path("fitted/pictures", name).read_bytes() == Path(name).read_bytes()
+    fitted = load_scene("fitted/scene.yaml").sheet
+    np.testing.assert_array_equal(rest_of(fitted).position, rest_of(load_scene("scene.yaml").sheet).position)
+    with pytest.raises(SceneError, match=r"sheet\.surface: "):
+        fit("scene.yaml", observed, ["tissue.map"], resolution=4, workers=1)
+    with pytest.raises(SceneError, match=r"sheet\.surface: "):
+        gradient(load_scene("scene.yaml"), lambda position: (0.0, 0 * position), threads=device.threads)
+
+
+def test_saved_session(depth: Path) -> None:
+    made = load_scene("scene.yaml")
+    saved = load_scene(Captures(Path("session"), "scene").save_scene(made))
+    assert saved.sheet.surface is not None
+    assert Path(saved.sheet.surface.path).parent == Path("session")
+    np.testing.assert_array_equal(rest_of(saved.sheet).position, rest_of(made.sheet).position)
+
+
+def test_sweep_of_the_surface(depth: Path) -> None:
+    """Choices of files, and values of the smoothing and the grid."""
+    np.save("deep.npy", wall(height=6.0))
+    vary = {
+        "sheet.surface.depth.file": {"choice": ["depth.npy", "deep.npy"]},
+        "sheet.surface.depth.smooth": {"uniform": [0, 3]},
+        "sheet.surface.grid": {"choice": ["even", "given"]},
+    }
+    outcomes = list(sweep("scene.yaml", vary, "swept", samples=4, overrides={"output": []}, workers=1))
+    assert [outcome.status for outcome in outcomes] == 4 * ["complete"]
+    surfaces = [json.loads(path.read_text())["surface"] for path in sorted(Path("swept/runs").glob("*/run.json"))]
+    assert len(surfaces) == 4
+    assert {each["sha256"] for each in surfaces} == {sha256(Path(name)) for name in ("depth.npy", "deep.npy")}
+    assert len({each["isotropy_error"]["mean"] for each in surfaces}) == 4
+    for path in Path("swept/runs").iterdir():
+        assert read_run(path).frames == 11
