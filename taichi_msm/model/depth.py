@@ -24,6 +24,9 @@ from taichi_msm.system.array_cache import cached_arrays
 # Largest share of pixels without depth, and of steep cells, those seen at more than MAX_ANGLE [degrees].
 MAX_FILLED, MAX_STEEP, MAX_ANGLE = 0.25, 0.01, 80.0
 
+# Inverse depth of pixels without sheet where it would have no end, relative to the least one of the sheet.
+MIN_INVERSE = 1e-3
+
 # Memory per pixel for smoothing and splines [bytes].
 DEPTH_PIXEL_BYTES = 450
 
@@ -89,8 +92,13 @@ def read_relief(section: DepthMap, frame: Frame, picture: Picture, mask: SheetMa
         ("inverse depth", repr(key)),
         lambda: (smooth_inverse_depth(1 / known.depth, known.is_known, *np.moveaxis(pixels, -1, 0), deviation),),
     )
-    if (inverse <= 0).any():
-        row, column = np.unravel_index(int((inverse <= 0).argmax()), inverse.shape)
+    is_endless = inverse <= 0
+    if is_sheet is not None:
+        # Without sheet, where a depth matters only to the spline, the surface is as far as it may be.
+        inverse = np.where(is_endless & ~is_sheet, MIN_INVERSE * inverse[is_sheet].min(), inverse)
+        is_endless &= is_sheet
+    if is_endless.any():
+        row, column = np.unravel_index(int(is_endless.argmax()), inverse.shape)
         remedy = "cut the region, or leave the place out by sheet.mask"
         raise PictureError(f"{path}: the depth has no end at {_pixel(column, row, frame)}", remedy)
     return Relief(_in_world(inverse, picture), filled, float(deviation), key)
