@@ -78,7 +78,7 @@ def _read_or_compute(surface: Surface, points: tuple[int, int], digest: str) -> 
     except FoldedGridError as error:
         across, down = error.place
         place = f"{across:.3g} across and {down:.3g} down"
-        remedy = "cut the region, leave the part out by sheet.mask, or take grid: given"
+        remedy = "take grid: given, or a file without that part"
         raise PictureError(f"no even grid: the surface has no area at {place}", remedy) from None
     with suppress(OSError):
         _store(path, grid)

@@ -194,7 +194,7 @@ def counts(scale: float, kind: type[np.unsignedinteger[Any]] = np.uint16) -> NDA
 def test_lines_of_check(depth: Path, message: Messages) -> None:
     message(lines())
     message(lines("sheet.surface.grid=given", "sheet.points=[9, 15]", "sheet.surface.depth.smooth=0"))
-    message(lines("sheet.points=[17, 9]"))
+    message(lines("sheet.points=[12, 11]"))
 
 
 def test_notes(depth: Path, message: Messages) -> None:
