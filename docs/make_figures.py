@@ -260,6 +260,7 @@ def main() -> None:
     animation("press", "press", 320)
     animation("grasp", "grasp", 320)
     animation("kidney", "kidney", 320)
+    animation("incision", "incision", 320)
     endoscope(224)
     four_pixels()
     stereo(0.8, 400)

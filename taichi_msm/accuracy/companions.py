@@ -43,7 +43,7 @@ class CompanionRuns(NamedTuple):
     mesh: bool = False  # whether there are companion runs on coarser meshes
     cost: float = 0.0  # cost of the parallel companion runs, in steps of the full sheet per step of the run
     reason: str = ""  # reason for a missing estimate of the time-step error; empty if there is one
-    second_mesh: bool = False  # whether a second run on a coarser mesh follows if the first, with contact, differs much
+    second_mesh: bool = False  # whether a second run on a coarser mesh with contact may follow
 
     @property
     def planned(self) -> bool:

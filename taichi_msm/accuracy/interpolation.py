@@ -85,7 +85,7 @@ def _masked_weights(mask: Mask, other: Mask) -> tuple[NDArray[np.bool_], csr_arr
     rows, cols, weights = [], [], []
     remaining, shape = np.ones(len(places), bool), other.points.shape
     for count in (4, 3, 2):
-        squares = sliding_window_view(other.cells, (count - 1, count - 1)).all(axis=(2, 3))
+        squares = np.all(sliding_window_view(other.cells, (count - 1, count - 1)), axis=(2, 3))
         # Rows and columns of cells in the square before that of the place, the most central ones first.
         befores = product(range(count - 1), repeat=2)
         for before in sorted(befores, key=lambda pair: math.hypot(pair[0] - count / 2 + 1, pair[1] - count / 2 + 1)):
@@ -104,7 +104,7 @@ def _masked_weights(mask: Mask, other: Mask) -> tuple[NDArray[np.bool_], csr_arr
 
 def _shifted_points(mask: Mask) -> Array:
     """Return row and column of each mass point, moved a little into its own cells, shape (rows, cols, 2)."""
-    points, middles = (np.stack(np.indices(each.shape), axis=-1) for each in (mask.points, mask.cells))
+    points, middles = (np.moveaxis(np.indices(each.shape), 0, -1) for each in (mask.points, mask.cells))
     inside = sum_around_points((middles + 0.5) * mask.cells[..., None]) / np.maximum(mask.cell_counts, 1)[..., None]
     return np.asarray(points + TOWARDS_INSIDE * (inside - points))
 

@@ -335,7 +335,8 @@ def _mesh_remedy(plan: Plan, mesh: MeshEstimate, affords: Callable[[Plan], bool]
     if mesh.doubt == WRINKLING:
         # A curved sheet has no bending.
         remedies = "tissue.pretension" if plan.scene.sheet.surface else "tissue.bending or tissue.pretension"
-        return f"hold every side and set {remedies}; otherwise a finer mesh has finer wrinkles"
+        edge = "the outline" if plan.scene.sheet.mask else "every side"
+        return f"hold {edge} and set {remedies}; otherwise a finer mesh has finer wrinkles"
     refinement = min(math.sqrt(mesh.error / (REMEDY_THRESHOLD / 2)), math.sqrt(MAX_POINTS_RATIO))
     rows, cols = (math.ceil((count - 1) * refinement) + 1 for count in plan.scene.sheet.points)
     if max(rows, cols) < MAX_POINTS and affords(plan_variant(plan, with_points(plan.scene, (rows, cols)))):

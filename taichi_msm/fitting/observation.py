@@ -113,6 +113,10 @@ class Observation(ABC):
         """Return a copy without the samples of a mask, which has the shape of the values without their last axis."""
         return replace(self, values=np.where(samples[..., None], np.nan, self.values))
 
+    def on_sheet(self, scene: Scene) -> Self:
+        """Return the observation without values of places on no sheet, which a mask leaves; by default unchanged."""
+        return self
+
     @abstractmethod
     def build_model(self, scene: Scene, frames: int) -> ObservationModel:
         """Return the map from a run to the values.

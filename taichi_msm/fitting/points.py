@@ -125,7 +125,7 @@ class PointObservation(Observation):
         return f"{self.name}: {self.kind}"
 
     def on_sheet(self, scene: Scene) -> Self:
-        """Return a copy without the points that fall on no sheet; raise a SceneError if none remains."""
+        """Return the observation without points that fall on no sheet; raise a SceneError if none remains."""
         if (mask := rest_of(scene.sheet).mask) is None or (covered := mask.covers(self.coordinates)).all():
             return self
         if not self.is_observed[covered].any():

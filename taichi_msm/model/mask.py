@@ -17,6 +17,9 @@ from taichi_msm.model.cells import sum_around_points
 # Places this close to an edge of a cell, in sides of a cell, are on it.
 EDGE_TOLERANCE = 1e-9
 
+# A middle of a cell between two pixels, up to rounding, takes the right or lower one [px].
+TIE = 1e-6
+
 
 @dataclass(frozen=True, eq=False)
 class Mask:
@@ -115,6 +118,6 @@ class Mask:
 def sample_nearest(is_sheet: NDArray[np.bool_], across: Array, down: Array) -> NDArray[np.bool_]:
     """Return the nearest pixels at fractions from left and top, which broadcast; False where they are NaN."""
     height, width = is_sheet.shape
-    column = np.clip(np.nan_to_num(across * width).astype(int), 0, width - 1)
-    row = np.clip(np.nan_to_num(down * height).astype(int), 0, height - 1)
+    column = np.clip(np.nan_to_num(across * width + TIE).astype(int), 0, width - 1)
+    row = np.clip(np.nan_to_num(down * height + TIE).astype(int), 0, height - 1)
     return np.asarray(is_sheet[row, column] & np.isfinite(across) & np.isfinite(down))

@@ -128,7 +128,7 @@ class PicturedRest(CurvedRest):
         """
         s_t, depth = self._solve(pixels[:, None], cells)
         miss = np.abs(s_t - np.clip(s_t, 0, 1)).max(axis=-1)
-        miss = np.where((depth > 0) & np.isfinite(miss), miss, np.inf).reshape(len(pixels), -1)
+        miss = np.where((depth > 0) & np.isfinite(miss), miss, np.inf).reshape(len(pixels), 2 * cells.shape[1])
         hit, depth = miss <= TOLERANCE, depth.reshape(miss.shape)
         best = np.where(hit.any(axis=1), np.where(hit, depth, np.inf).argmin(axis=1), miss.argmin(axis=1))
         rows = np.arange(len(pixels))

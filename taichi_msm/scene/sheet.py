@@ -210,7 +210,9 @@ class Sheet(Section):
     def with_frozen_surface(self, smooth: float | None, grid: KeptGrid | None) -> Sheet:
         """Return a copy whose surface of a file follows from its own mass points, as a run has used it.
 
-        `smooth` is the standard deviation [px] in place of that of a depth map, if it is given.
+        Args:
+            smooth: standard deviation in place of that of a depth map [px]; None for no change.
+            grid: even grid, of as many mass points as the sheet's; None to minimise it, or for a grid as in the file.
         """
         surface = self.surface
         if surface is None or surface.frame is None:

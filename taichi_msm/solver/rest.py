@@ -270,7 +270,8 @@ class QuasiStatics(SheetSolver[Relaxation]):
         support = "a foundation, pretension or, if it is flat, bending"
         remedy = f"the sheet may hang slack, fold or wrinkle; give it {support}, or take less load"
         if not (plan.is_held or plan.material.virtual > 0):
-            remedy = "nothing holds the sheet; fix a side, or give it a foundation"
+            sheet = "a part of the sheet" if plan.loose_parts else "the sheet"
+            remedy = f"nothing holds {sheet}; fix a side, or give it a foundation"
         elif (self._touched().sum(axis=0) > 1).any():
             remedy = "two tools press on one point; keep them apart"
         message = (

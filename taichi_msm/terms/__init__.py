@@ -82,11 +82,10 @@ def memory_names(plan: Plan) -> tuple[str, ...]:
 def fictitious_masses(material: Material, sheet: Sheet) -> NDArray[np.float64]:
     """Compute fictitious masses of the mass points, shape (rows, cols) [N/m].
 
-    In their dimensionless time every angular frequency of the sheet is at most 1. Points without sheet have any mass.
+    In their dimensionless time every angular frequency of the sheet is at most 1. Points without sheet have mass 0.
     """
     bounds = [np.broadcast_to(term.node_stiffness_bounds(material, sheet), sheet.points) for term in TERMS]
-    masses, mask = np.asarray(np.sum(bounds, axis=0)), rest_of(sheet).mask
-    return masses if mask is None else np.where(mask.points, masses, masses.max())
+    return np.asarray(np.sum(bounds, axis=0))
 
 
 def highest_frequency(material: Material, sheet: Sheet) -> float:

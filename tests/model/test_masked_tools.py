@@ -14,11 +14,11 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from taichi_msm import Simulation
-from taichi_msm.accuracy.contact_warnings import first_piercing_probe
+from taichi_msm.accuracy.contact_warnings import _stiffnesses, first_piercing_probe
 from taichi_msm.accuracy.divergence import displacement_bound
 from taichi_msm.accuracy.mask import mask_notes
 from taichi_msm.cli.main import main
-from taichi_msm.errors import SceneError
+from taichi_msm.errors import DivergedError, SceneError
 from taichi_msm.load.scene_file import load_plan
 from taichi_msm.model.mask import Mask
 from taichi_msm.model.plan import Plan
@@ -109,11 +109,8 @@ def test_gap_of_a_ball() -> None:
     low, high = rest.position[rows + 1, cols], rest.position[rows, cols + 1]
     for x, y, z in product((0, 0.0021, 0.0055, 0.02), (0, 0.0013), (-0.004, 0.0005, 0.002, 0.005)):
         centre = np.array([x, y, z])
-        axis = centre + np.linspace(0, 1, 2)[:1, None] * tool.axis  # the shaft is clear of the sheet above it
-        distance = np.linalg.norm(axis - np.clip(axis, low, high), axis=1).min()
-        if z < 0:  # the shaft goes through the plane at x and y
-            through = np.array([x, y, 0.0])
-            distance = np.linalg.norm(through - np.clip(through, low, high), axis=1).min()
+        nearest = np.array([x, y, max(z, 0.0)])  # of the upright axis to the plane
+        distance = np.linalg.norm(nearest - np.clip(nearest, low, high), axis=1).min()
         gap = tool.gap_at(centre, plan.scene.sheet)
         expected = distance - tool.radius
         assert 0 < gap <= expected if expected > 0 else gap == pytest.approx(expected, abs=1e-6 * tool.radius)
@@ -194,6 +191,10 @@ def test_largest_pressure_is_on_the_sheet() -> None:
             total, pressure = sum_probe_forces(probe, sheet, refinement)
             assert 0.03 < total < 0.07  # half of the force acts beyond the outline
             assert pressure == pytest.approx(0.1 / (2 * math.pi / 1000**2), rel=1e-2)
+            # One cell beyond the outline, as on a coarser mesh, the pressure at the outline is exp(-2) of that.
+            beyond = probe.model_copy(update={"at": (2 / 3 + 1 / 30, 0.5)})
+            lower = sum_probe_forces(beyond, sheet, refinement)[1]
+            assert lower == pytest.approx(math.exp(-2) * pressure, rel=1e-2)
 
 
 @pytest.mark.parametrize(
@@ -267,6 +268,22 @@ def test_parts_that_nothing_holds(message: Messages) -> None:
     message(list(mask_notes(clamped)), "row 0, column 22")
     for held in (plan_of(), plan_of(tissue__foundation=1e6, sheet__fixed=["left"])):
         assert list(mask_notes(held)) == []
+
+
+def test_a_force_on_a_loose_part_at_rest(message: Messages) -> None:
+    split()
+    simulation = Simulation(plan_of(sheet__fixed=["left"], probes=[push([0.8, 0.5])], time__motion="quasistatic").scene)
+    with message.raises(DivergedError, "nothing holds a part of the sheet", hide=r"after .* point \(\d+, \d+\)"):
+        simulation.advance(5)
+
+
+def test_mean_stiffness_of_the_sheet() -> None:
+    """Factors of a map in the hole do not count in the warning about a sheet that slides off a tip."""
+    Image.fromarray(round_hole()).save("stiff.png")
+    stiff = {"image": "stiff.png", "range": [9, 1]}
+    membrane, _ = _stiffnesses(plan_of(tissue__map=stiff))
+    # The middle of a cell is that of a pixel, so that the map is 1 in all cells of the sheet.
+    assert membrane == pytest.approx(3e4 * 0.002, rel=1e-12)
 
 
 def test_check(message: Messages, capsys: pytest.CaptureFixture[str]) -> None:

@@ -17,6 +17,7 @@ from taichi_msm.runs.simulation import Simulation
 from taichi_msm.scene.scene import Scene
 from taichi_msm.system.runtime import Device
 
+WIDTH, CUT = 0.08, 0.08 / 3  # of a square sheet, and length of a cut across the pull in its middle [m]
 SIDE, RADIUS = 0.1, 0.015  # of the square plate and of the hole in its middle [m]
 STRAIN = 1e-4  # of the plate's width, small enough for linear elasticity
 
@@ -95,3 +96,28 @@ def test_opening_matches_finite_elements(points: int, tmp_path: Path, device: De
     np.testing.assert_allclose(
         opening(tmp_path, points, threads=device.threads), finite_elements(), rtol=half_cell / RADIUS
     )
+
+
+def gape(folder: Path, cells: int, strain: float, threads: int | None = None) -> float:
+    """Return the opening of the middle of a cut, one cell wide, in a sheet of cells x cells that is stretched [m]."""
+    middle, half = cells // 2, cells // 6
+    white = np.full((cells, cells), 255, np.uint8)
+    white[middle - half : middle + half + 1, middle] = 0
+    Image.fromarray(white).save(folder / "cut.png")
+    scene = Scene(
+        sheet={"points": [cells + 1] * 2, "size": [WIDTH] * 2, "fixed": ["left"], "mask": str(folder / "cut.png")},
+        tissue={"young": 2.46e5, "thickness": 2e-3, "density": 1100, "damping": 400},
+        probes=[{"clamp": "right", "path": [[0, 0, 0, 0], [0.5, strain * WIDTH, 0, 0]]}],
+        time={"duration": 2, "frames_per_second": 5, "precision": "f64"},
+        output=[],
+    )
+    with Simulation(scene, threads=threads) as simulation:
+        simulation.advance(scene.time.frames)
+        lips = simulation.positions()[middle : middle + 2, middle : middle + 2, 0].mean(axis=0)
+    return float(lips[1] - lips[0]) - WIDTH / cells
+
+
+def test_wound_gapes_like_a_crack(tmp_path: Path, device: Device) -> None:
+    # A crack of length 2 a in a wide sheet opens by 4 a times the strain. Here it is a third of the width, which adds
+    # some percent, and the clamped sides, which keep their length, take some.
+    assert gape(tmp_path, 27, 0.02, device.threads) == pytest.approx(4 * CUT / 2 * 0.02, rel=0.1)

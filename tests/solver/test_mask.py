@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -11,10 +12,14 @@ import pytest
 from numpy.typing import NDArray
 from PIL import Image
 
+from taichi_msm import FilesError, resume, run
+from taichi_msm.model.geometry import CurvedRest
 from taichi_msm.model.mask import Mask
 from taichi_msm.model.rest import rest_of
+from taichi_msm.model.tool_force import control_point
 from taichi_msm.scene.scene import Scene
-from taichi_msm.scene.sheet import SheetMask
+from taichi_msm.scene.sheet import Sheet, SheetMask
+from taichi_msm.solver import dynamics as dynamics_module
 from taichi_msm.solver.arrays import SheetLayout
 from taichi_msm.solver.dynamics import Dynamics
 from taichi_msm.solver.planning import make_plan
@@ -26,9 +31,12 @@ from taichi_msm.terms.contact_rest import touched_points
 from taichi_msm.terms.elasticity import energy_density
 from taichi_msm.terms.springs import assemble_springs
 from tests import reference
+from tests.outputs import results as outcomes
+from tests.reference import surface
 from tests.reference.loads import frame_loads
 from tests.reference.mask import cell_counts, held_points, present_cells
 from tests.reference.sheet import highest_frequency as twin_frequency
+from tests.runs.test_resume import interrupted
 from tests.scenes import random_tissue, speckle
 from tests.solver.test_dynamics import as_on_a_gpu
 from tests.solver.test_same_bits import states
@@ -61,8 +69,8 @@ MAPS: Any = {
 TUBE = {"tube": {"radius": 0.04, "folds": {"depth": 0.004, "spacing": 0.03}}}
 LOADS: Any = [
     {"at": [0.45, 0.6], "total": -0.6, "radius": 0.01, "load": [[0, 0], [0.05, 100]]},
-    {"at": [[0, 0.1, 0.2], [0.1, 0.9, 0.9]], "total": [0.1, 0.2, 0.3], "radius": 0.01, "load": [[0, 100]]},
-    {"at": [0.25, 0.25], "total": [0.1, 0, 0.3], "radius": 0.02},
+    {"at": [[0, 0.9, 0.2], [0.1, 0.85, 0.65]], "total": [0.1, 0.2, 0.3], "radius": 0.01, "load": [[0, 100]]},
+    {"at": [0.1, 0.3], "total": [0.1, 0, 0.3], "radius": 0.02},
 ]
 BALL: Any = {
     "path": [[0, 0.3, 0.3, 0.002], [0.04, 0.3, 0.3, -0.004], [0.1, 0.5, 0.5, -0.005]],
@@ -83,7 +91,7 @@ CASES: dict[str, Any] = {
         },
         "probes": LOADS,
     },
-    "bending": {**OUTLINE, "tissue": {"bending": 2e-5}, "probes": LOADS},
+    "bending": {**OUTLINE, "tissue": {"bending": 1e-3}, "probes": LOADS},
     "tense plate": {"fixed": ["left", "outline"], "tissue": {"bending": "plate", "pretension": 2}, "probes": [BALL]},
     "ball": {"probes": [BALL, LOADS[1]]},
     "friction": {"probes": [{**BALL, "friction": 0.4}, LOADS[1]]},
@@ -155,6 +163,7 @@ def test_motion_matches_twin(case: str, device: Device) -> None:
 
 @pytest.mark.parametrize("case", CASES)
 def test_material_matches_twin(case: str) -> None:
+    """Also of curved sheets, whose numbers are those of the cells that are sheet."""
     scene = scene_of(case)
     plan, twin = make_plan(scene), reference.sheet(scene)
     np.testing.assert_array_equal(rest_of(scene.sheet).present, present_cells(scene.sheet))
@@ -165,10 +174,52 @@ def test_material_matches_twin(case: str) -> None:
         np.testing.assert_allclose(k, own.stiffness, rtol=1e-12, atol=0)
         pull = own.stiffness * (own.length - own.unstretched) / own.length
         np.testing.assert_allclose(tau, pull, rtol=0, atol=1e-12 * own.stiffness.max())
-    # The bound is section 1's, without those of points that no force moves; bending adds its own.
     if not plan.material.bending:
         frequency = highest_frequency(plan.material, scene.sheet)
         assert frequency == pytest.approx(twin_frequency(scene), rel=1e-12)
+    rest, cells, present = rest_of(scene.sheet), surface.cells(twin.rest), present_cells(scene.sheet)
+    sides = [own.length[own.stiffness > 0] for own in twin.springs[:2]] if twin.is_curved else []
+    if isinstance(rest, CurvedRest):
+        assert rest.shortest_side == pytest.approx(min(each.min() for each in sides), rel=1e-12)
+        assert rest.longest_side == pytest.approx(max(each.max() for each in sides), rel=1e-12)
+        means = [np.linalg.norm(side[present], axis=-1).mean() for side in (cells.a, cells.b)]
+        assert rest.cell_sides == pytest.approx(means, rel=1e-12)
+        np.testing.assert_allclose(rest.areas, twin.area, rtol=1e-12, atol=0)
+        expected = surface.isotropy_error(cells) * present
+        np.testing.assert_allclose(rest.isotropy_errors, expected, rtol=0, atol=1e-12)
+
+
+@pytest.mark.parametrize("dtype", [np.uint8, np.uint16])
+def test_pixels_match_twin(dtype: type) -> None:
+    """Pictures of fewer and of more pixels than cells."""
+    for size in ((5, 7), (13, 40), (26, 28)):
+        grey = np.random.default_rng(0).integers(0, np.iinfo(dtype).max, size, dtype=dtype, endpoint=True)
+        Image.fromarray(grey).save("mask.png")
+        for invert in (False, True):
+            sheet = scene_of("loads", {"mask": {"image": "mask.png", "invert": invert}}).sheet
+            np.testing.assert_array_equal(rest_of(sheet).present, present_cells(sheet))
+
+
+def test_parts_that_meet_at_a_point() -> None:
+    """Two holes may meet at one, and parts that hang together elsewhere."""
+    falling, rising = np.eye(2, dtype=bool), np.eye(2, dtype=bool)[::-1]
+    ring = ~np.pad(falling, 1)
+    assert [list(Mask(cells).pinched_points()) for cells in (falling, rising, ring)] == [[(1, 1)], [(1, 1)], []]
+
+
+@pytest.mark.parametrize("place", [(0.01, 0.0, 0.05), (1.0, 2.0, 3.0)])
+def test_places_of_points_without_sheet_do_not_matter(place: Any, device: Device) -> None:
+    """They make cells without area, or long ones."""
+    shape = surface.rest_positions({"dome": {"radius": 0.1}}, (14, 15), (0.12, 0.14))
+    results = []
+    for absent in (shape, np.array(place)):
+        count = cell_counts(present_cells(scene_of("loads").sheet))[..., None]
+        np.save("points.npy", np.where(count > 0, shape, absent))
+        keys = {"points": POINTS, "surface": {"points": {"file": "points.npy", "unit": "m"}}, "mask": "mask.png"}
+        scene = scene_of("dome, tense, locking")
+        scene = scene.model_copy(update={"sheet": Sheet(**keys, fixed=["outline"]), "probes": scene.probes[:1]})
+        results.append((make_plan(scene).stable_step, frames(scene, device).tobytes()))
+    assert results[0] == results[1]
 
 
 @DEFAULT
@@ -268,15 +319,24 @@ def test_rectangle_of_a_mask_is_a_smaller_sheet(fixed: str, device: Device) -> N
         Scene(output=[], sheet=sheet, tissue={**TISSUE, **LOCK}, probes=probes, time=time)
         for sheet, probes in ((masked, (place, ball)), (whole, moved))
     )
+    assert make_plan(large).is_held == make_plan(small).is_held == (fixed == "outline")
     assert make_plan(large).stable_step == pytest.approx(make_plan(small).stable_step, rel=1e-12)
     u = frames(small, device)
     assert np.abs(u).max() > 1e-3
     np.testing.assert_allclose(frames(large, device)[:, 3:9, 4:11], u, rtol=0, atol=1e-12 * np.abs(u).max())
 
 
-def random_cells(seed: int, rows: int, cols: int) -> NDArray[np.bool_]:
-    """Two thirds of the cells at random; of two parts that meet at a point one cell more is sheet."""
+def random_cells(seed: int, scene: Scene) -> NDArray[np.bool_]:
+    """Two thirds of the cells at random, and those under force-controlled tools.
+
+    Of two parts that meet at a point, one cell more is sheet.
+    """
+    rows, cols = (count - 1 for count in scene.sheet.points)
     cells = np.random.default_rng(seed).random((rows, cols)) < 2 / 3
+    for probe, time in product(scene.probes, np.linspace(0, scene.time.duration, 400)):
+        if not probe.moved:
+            across, down = rest_of(scene.sheet).fractions(control_point(probe, scene.sheet, time))
+            cells[int(down * rows), int(across * cols)] = True
     while pinched := next(Mask(cells).pinched_points(), None):
         cells[pinched[0] - 1, pinched[1]] = cells[pinched] = True
     return cells
@@ -287,8 +347,7 @@ def random_cells(seed: int, rows: int, cols: int) -> NDArray[np.bool_]:
 def test_random_masks_match_twin(seed: int, device: Device) -> None:
     """Tissues of `random_tissue`, whose sides are free or fixed, with a border fixed as an outline."""
     made = random_tissue(seed, "map.png")
-    rows, cols = made.sheet.points
-    write_mask(["".join("#" if cell else "." for cell in row) for row in random_cells(seed, rows - 1, cols - 1)])
+    write_mask(["".join("#" if cell else "." for cell in row) for row in random_cells(seed, made)])
     fixed = "outline" if made.sheet.fixed == "border" else made.sheet.fixed
     sheet = made.sheet.model_copy(update={"mask": SheetMask(image="mask.png"), "fixed": fixed})
     made = made.model_copy(update={"sheet": sheet})
@@ -300,3 +359,25 @@ def test_random_masks_match_twin(seed: int, device: Device) -> None:
     layout = choose_layout(plan, device)
     gathered = replace(layout, workers=0, config=replace(layout.config, lanes=1))
     np.testing.assert_allclose(frames(made, device, gathered), expected, rtol=0, atol=atol)
+
+
+@pytest.mark.slow
+def test_interrupted_run_with_a_mask(device: Device, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """It resumes with the bits of an uninterrupted one, and restarts with another mask."""
+    monkeypatch.setattr(dynamics_module, "MAX_STEPS_PER_LAUNCH", 300)
+    time = {"frames_per_second": 100, "step": 1e-5}
+    made = scene_of("tense, maps, relaxing", **time).model_copy(update={"output": ("trajectory",)})
+    run(made, "whole", threads=device.threads, estimate_error=False)
+    with np.load("whole/trajectory.npz") as whole:
+        absent = cell_counts(present_cells(made.sheet)) == 0
+        assert (whole["position"][:, absent] == whole["position"][0, absent]).all()
+    interrupted(made, "parts", device)
+    assert resume("parts", threads=device.threads)["resumed"] > 0
+    assert outcomes(tmp_path / "parts") == outcomes(tmp_path / "whole")
+    interrupted(made, "parts", device)
+    write_mask(["#" * 14] * 13)
+    with pytest.raises(FilesError, match="mask"):
+        resume("parts", threads=device.threads)
+    # As another process reads the file.
+    made = scene_of("tense, maps, relaxing", **time).model_copy(update={"output": ("trajectory",)})
+    assert run(made, "parts", threads=device.threads, estimate_error=False)["resumed"] == 0
