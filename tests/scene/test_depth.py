@@ -22,8 +22,10 @@ from taichi_msm.load.cost import estimate_budget
 from taichi_msm.load.scene_file import load_plan, load_scene, schema
 from taichi_msm.model.depth import DEPTH_PIXEL_BYTES
 from taichi_msm.model.geometry import CurvedRest
-from taichi_msm.model.rest import rest_of
+from taichi_msm.model.rest import _rest, rest_of
 from taichi_msm.render.notes import drawing_warnings
+from taichi_msm.scene.scene import Scene
+from taichi_msm.solver.planning import make_plan
 from taichi_msm.surfaces.surface import point_surface, positions
 from tests.depths import HEIGHT, WIDTH, wall, write_depth_scene
 from tests.golden import Messages
@@ -230,6 +232,9 @@ def test_depths_in_steps(name: str, depth: Path, message: Messages) -> None:
     assert steps is not None
     assert steps.size == pytest.approx(0.5e-3, rel=0.005)
     message(next(iter(surface_notes(plan.scene))), "depth.smooth: ")
+    message(
+        next(iter(surface_notes(load_plan("scene.yaml", {"sheet.surface.depth.unit": unit}).scene))), "smoothing by"
+    )
     # A pixel is (60 mm / 40 px) wide, and a step becomes a tenth as steep as a pixel is wide.
     assert steps.smooth == pytest.approx(0.5 / (0.1 * 1.5 * np.sqrt(2 * np.pi)), rel=0.1)
 
@@ -319,3 +324,28 @@ def test_schema(depth: Path) -> None:
         jsonschema.validate(load_scene("scene.yaml").model_dump(mode="json", exclude_none=True), schema())
         jsonschema.validate(yaml.safe_load(Path("scene.yaml").read_text()), schema())
         write_points("\n    picture: main\n    grid: even")
+
+
+def test_depth_without_an_end(depth: Path, message: Messages) -> None:
+    """A map whose inverse depth falls to the right, where a quarter of it is missing."""
+    inverse = np.tile(np.linspace(1, 0.1, WIDTH), (HEIGHT, 1))
+    np.save("depth.npy", np.where(np.arange(WIDTH) < 40, 20 / (inverse - 0.2), np.nan))
+    with message.raises(SceneError, "scene.yaml:5:13: sheet.surface.depth.file: depth.npy"):
+        load_scene("scene.yaml")
+
+
+def test_memory_for_smoothing(depth: Path, monkeypatch: pytest.MonkeyPatch, message: Messages) -> None:
+    monkeypatch.setattr(images, "available_memory", lambda: DEPTH_PIXEL_BYTES * WIDTH * HEIGHT - 1)
+    _rest.cache_clear()
+    with message.raises(SceneError, "scene.yaml:5:13: sheet.surface.depth.file: depth.npy", hide=r"0\.\d+ MiB"):
+        load_scene("scene.yaml")
+
+
+def test_scene_of_a_missing_image(depth: Path, message: Messages) -> None:
+    """A scene is valid without its files, as in another folder, but cannot be planned."""
+    made = load_scene("scene.yaml")
+    Path("frame.png").unlink()
+    with message.raises(SceneError, "sheet.surface.depth.file"):
+        make_plan(Scene(**made.model_dump()))
+    Image.new("RGB", (WIDTH, HEIGHT)).save("frame.png")
+    assert make_plan(Scene(**made.model_dump())).scene == made
