@@ -90,7 +90,7 @@ def read_relief(section: DepthMap, frame: Frame, picture: Picture, mask: SheetMa
     key = (section.numbers.sha256, section.unit, section.along, float(deviation), frame.region, outline, picture.key)
     (inverse,) = cached_arrays(
         ("inverse depth", repr(key)),
-        lambda: (smooth_inverse_depth(1 / known.depth, known.is_known, *np.moveaxis(pixels, -1, 0), deviation),),
+        lambda: (smooth_inverse_depth(1 / known.depth, known.is_known, pixels[..., 0], pixels[..., 1], deviation),),
     )
     is_endless = inverse <= 0
     if is_sheet is not None:

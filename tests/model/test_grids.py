@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from taichi_msm.model import grids
 from taichi_msm.model.grids import MAX_FILES, kept_grid, report_grids, user_folder
 from taichi_msm.scene.surface import Frame
-from taichi_msm.surfaces.even_grid import EvenGrid
+from taichi_msm.surfaces.even_grid import EvenGrid, even_grid
 from taichi_msm.surfaces.surface import Surface, given_grid, point_surface
 from taichi_msm.system import array_cache
 
@@ -34,9 +34,8 @@ def computed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> list[int]:
 
     def count(*arguments: object) -> EvenGrid:
         calls.append(len(calls))
-        return original(*arguments)  # type: ignore[arg-type]
+        return even_grid(*arguments)  # type: ignore[arg-type]
 
-    original = grids.even_grid
     monkeypatch.setattr(grids, "even_grid", count)
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
     return calls

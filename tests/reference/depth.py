@@ -71,7 +71,7 @@ class Map:
             known &= z != np.iinfo(z.dtype).max
         if self.is_sheet is not None:
             known &= self.is_sheet
-        column, row = np.meshgrid(np.arange(width), np.arange(height))
+        column, row = np.meshgrid(np.arange(width, dtype=float), np.arange(height, dtype=float))
         x, y = self.camera.sights(left + column + 0.5, top + row + 0.5)
         depth = np.where(known, z, 1.0) * self.unit
         if self.along == "ray":

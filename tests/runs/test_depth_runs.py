@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import json
+from collections import OrderedDict
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -44,7 +46,7 @@ def depth(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 def forget(monkeypatch: pytest.MonkeyPatch) -> None:
     """Forget all sheets and arrays in memory, as another process."""
-    monkeypatch.setattr(array_cache, "_arrays", array_cache.OrderedDict())
+    monkeypatch.setattr(array_cache, "_arrays", OrderedDict())
     rest._rest.cache_clear()
 
 
@@ -205,7 +207,7 @@ def test_saved_session(depth: Path) -> None:
 def test_sweep_of_the_surface(depth: Path) -> None:
     """Choices of files, and values of the smoothing and the grid."""
     np.save("deep.npy", wall(height=6.0))
-    vary = {
+    vary: dict[str, dict[str, Any]] = {
         "sheet.surface.depth.file": {"choice": ["depth.npy", "deep.npy"]},
         "sheet.surface.depth.smooth": {"uniform": [0, 3]},
         "sheet.surface.grid": {"choice": ["even", "given"]},

@@ -349,3 +349,20 @@ def test_scene_of_a_missing_image(depth: Path, message: Messages) -> None:
         make_plan(Scene(**made.model_dump()))
     Image.new("RGB", (WIDTH, HEIGHT)).save("frame.png")
     assert make_plan(Scene(**made.model_dump())).scene == made
+
+
+def test_kinds_of_files(depth: Path) -> None:
+    """Floats in an archive, as third numbers of points and in a TIFF, and counts in a PNG: the same sheet."""
+    depths = wall().astype(np.float32)
+    np.savez("depth.npz", other=np.zeros(3), depth=depths)
+    np.save("points.npy", np.stack([0 * depths, 0 * depths, depths], axis=-1))
+    Image.fromarray(depths).save("depth.tiff")
+    Image.fromarray(counts(0.002)).save("depth.png")
+    np.save("depth.npy", depths)
+    expected = rest_of(load_scene("scene.yaml").sheet).position
+    for name in ("depth.npz", "points.npy", "depth.tiff"):
+        same = load_scene("scene.yaml", {"sheet.surface.depth.file": name})
+        np.testing.assert_array_equal(rest_of(same.sheet).position, expected)
+    rounded = load_scene("scene.yaml", {"sheet.surface.depth": {"file": "depth.png", "unit": 2e-6}})
+    # Half a count, and up to as much to the side, where an even grid follows the surface.
+    np.testing.assert_allclose(rest_of(rounded.sheet).position, expected, rtol=0, atol=4e-6)
