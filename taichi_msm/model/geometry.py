@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from taichi_msm.arithmetic import Array
 from taichi_msm.model.cells import Cells, isotropy_errors, sum_around_points, unit
-from taichi_msm.model.mask import Mask
+from taichi_msm.model.mask import EDGE_TOLERANCE, Mask
 
 
 class Rest(ABC):
@@ -95,6 +95,16 @@ class Rest(ABC):
     def sheet_places(self, mesh: Array) -> Array:
         """Return the fractions across and down at (u, v), shape (n, 2) each: the inverse of `mesh_places`."""
         return mesh
+
+    def covers(self, fractions: Array, tolerance: float = EDGE_TOLERANCE) -> NDArray[np.bool_]:
+        """Return whether places across and down, shape (n, 2), are on the sheet; `tolerance` in sides of a cell."""
+        if self.mask is None:
+            return np.ones(len(fractions), bool)
+        return self.mask.covers(self.mesh_places(fractions), tolerance)
+
+    def first_gap(self, start: Array, end: Array) -> float | None:
+        """Return the fraction of a line between two places across and down at which it leaves the sheet, or None."""
+        return None if self.mask is None else self.mask.first_gap(start, end)
 
     @property
     def cell_places(self) -> tuple[Array, Array]:

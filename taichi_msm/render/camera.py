@@ -22,6 +22,7 @@ from taichi_msm.cameras.lens import IDENTITY_LENS
 from taichi_msm.cameras.view import View, companion_view, pinhole_view
 from taichi_msm.errors import Key, Problem, SceneError
 from taichi_msm.lenses.model import MAX_RADIUS
+from taichi_msm.model.pictured import PicturedRest
 from taichi_msm.model.rest import rest_of
 from taichi_msm.model.surface import Solid
 from taichi_msm.scene.camera import Camera
@@ -106,6 +107,16 @@ def _view_of(scene: Scene, time: float, name: str) -> View:
         matrix[:, 3] -= matrix[:, :3] @ shift
         result = result._replace(matrix=matrix, eye=result.eye + shift)
     return result
+
+
+def picture_view(scene: Scene, texture_size: tuple[int, int]) -> View:
+    """Return the view of the camera of a picture on the sheet, for pixels that are texels; its light is at it."""
+    rest, surface = rest_of(scene.sheet), scene.sheet.surface
+    assert isinstance(rest, PicturedRest)
+    assert surface is not None
+    assert surface.frame is not None
+    distance = _distance(surface.frame.cameras[-1], scene)
+    return rest.picture.view.cropped(rest.picture.region, texture_size)._replace(near=_near(scene), distance=distance)
 
 
 def is_moving(scene: Scene, name: str = "") -> bool:

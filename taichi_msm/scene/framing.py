@@ -15,6 +15,9 @@ from taichi_msm.scene.surface import Frame
 # A camera at the origin that looks along -z, with x to the right and y up, in the convention of `Pose`.
 POSE_AT_ORIGIN = {"rotation": [[1, 0, 0], [0, -1, 0], [0, 0, -1]], "translation": [0, 0, 0]}
 
+# The light on a picture by a camera by default: the gloss is in the picture.
+MATTE = {"gloss": 0.0}
+
 # Name of the main camera in `picture` if it has none.
 MAIN = "main"
 
@@ -31,11 +34,13 @@ def framed_image_size(data: Mapping[str, Any]) -> tuple[int, int] | None:
 
 
 def complete_framed(data: Mapping[str, Any], size: tuple[int, int]) -> Mapping[str, Any]:
-    """Add to the sections of a scene the size of its pictures, and the pose of the camera of a depth map."""
+    """Add to the sections of a scene the size and light of its pictures, and the pose of the camera of a depth map."""
     render, depth = data.get("render", {}), _get(data, "sheet", "surface", "depth")
     if not isinstance(render, Mapping):
         return data
     render = {"size": size, **render}
+    if isinstance(light := render.get("light", {}), Mapping):
+        render["light"] = {**MATTE, **light}
     cameras = render.get("cameras")
     if depth is not None and isinstance(render.get("camera"), Mapping):
         render["camera"] = _at_origin(render["camera"])

@@ -495,8 +495,8 @@ def _force_tool(plan: Plan, scene_probes: Sequence[Probe]) -> ForceControlledToo
     probe = next((probe for probe in plan.scene.probes if not probe.moved), None)
     if probe is None:
         return None
-    start, mask = clear_start(probe, scene_probes, plan.scene), rest_of(plan.scene.sheet).mask
-    return ForceControlledTool(probe, plan.grid.frames_per_second, start, mask)
+    start = clear_start(probe, scene_probes, plan.scene)
+    return ForceControlledTool(probe, plan.grid.frames_per_second, start, rest_of(plan.scene.sheet))
 
 
 def _position_tool(plan: Plan, scene_probes: Sequence[Probe]) -> PositionControlledTool | None:
