@@ -34,7 +34,6 @@ BOWL = 0.11  # radius of the bowl [m]
 SIZE = 480, 384  # of the frame [px]
 UNIT = 2e-5  # of the depth [m]
 CAMERA = {"eye": [0.006, -0.042, 0.068], "target": [0.002, -0.008, 0.006], "fov": 62}
-LIGHT = {"ambient": 0.06, "gloss": 0.5, "relief": 0.06}
 
 TISSUE = np.array([246.0, 186.0, 150.0])  # RGB of bloodless mucosa
 
@@ -66,38 +65,41 @@ def heights(rng: np.random.Generator, folds: Field, crypts: Field) -> Field:
     return FOLD * folds + BOWL - np.sqrt(BOWL**2 - from_axis**2) + 1.2e-4 * noise(rng, 5) + 6e-5 * crypts
 
 
+def write_wall(folder: Path) -> dict[str, object]:
+    """Write wall.png and wall.npy, the picture and heights of the wall; return sections of a scene with both."""
+    rng = np.random.default_rng(21)
+    folds, crypts = rugae(rng), honeycomb(rng, 6.5)
+    paint(rng, folds, crypts).save(folder / "wall.png")
+    np.save(folder / "wall.npy", heights(rng, folds, crypts))
+    return {
+        "image": str(folder / "wall.png"),
+        "sheet": {
+            "points": [401, 401],
+            "size": [SIDE, SIDE],
+            "surface": {"height": {"file": str(folder / "wall.npy"), "unit": "m"}},
+        },
+        "time": {"duration": 1, "frames_per_second": 1, "motion": "quasistatic"},
+        "render": {
+            "size": list(SIZE),
+            "refine": 2,
+            "supersample": 4,
+            "camera": CAMERA,
+            "shading": "tissue",
+            "light": {"ambient": 0.06, "gloss": 0.5, "relief": 0.06},
+        },
+        "output": ["png", "depth"],
+    }
+
+
 def main() -> None:
     """Write both, into the given folder or, by default, beside this script."""
     folder = Path(sys.argv[1]) if len(sys.argv) > 1 else Path(__file__).parent
-    rng = np.random.default_rng(21)
-    folds, crypts = rugae(rng), honeycomb(rng, 6.5)
     with tempfile.TemporaryDirectory() as name:
-        wall = Path(name)
-        paint(rng, folds, crypts).save(wall / "wall.png")
-        np.save(wall / "wall.npy", heights(rng, folds, crypts))
-        scene = Scene(
-            image=str(wall / "wall.png"),
-            sheet={
-                "points": [401, 401],
-                "size": [SIDE, SIDE],
-                "surface": {"height": {"file": str(wall / "wall.npy"), "unit": "m"}},
-            },
-            springs={"structural": 1},
-            time={"duration": 1, "frames_per_second": 1, "motion": "quasistatic"},
-            render={
-                "size": list(SIZE),
-                "refine": 2,
-                "supersample": 4,
-                "camera": CAMERA,
-                "shading": "tissue",
-                "light": LIGHT,
-            },
-            output=["png", "depth"],
-        )
-        run(scene, wall / "out", estimate_error=False)
-        with Image.open(wall / "out" / "frames" / "0000.png") as frame:
+        out = Path(name) / "out"
+        run(Scene(springs={"structural": 1}, **write_wall(Path(name))), out, estimate_error=False)
+        with Image.open(out / "frames" / "0000.png") as frame:
             frame.convert("RGB").save(folder / "frame.jpg", quality=90)
-        with Image.open(wall / "out" / "depth" / "0000.tiff") as depths:
+        with Image.open(out / "depth" / "0000.tiff") as depths:
             counts = np.rint(np.asarray(depths) / UNIT).astype(np.uint16)
     Image.fromarray(counts).save(folder / "frame-depth.png", optimize=True)
     print(f"{1000 * UNIT * counts.min():.1f} to {1000 * UNIT * counts.max():.1f} mm deep")
