@@ -1,0 +1,203 @@
+"""Press a wall, and the sheet that its frame and depth become, and compare both, for docs/frame.md.
+
+    PYTHONPATH=. python docs/make_frame.py
+
+Needs OpenCV, for the depth of a stereo pair. Takes about two minutes.
+"""
+
+from __future__ import annotations
+
+import json
+import sys
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any, NamedTuple
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+from PIL import Image
+from scipy.interpolate import CloughTocher2DInterpolator
+from scipy.ndimage import map_coordinates
+
+from benchmarks.marked import replace_marked, table
+from taichi_msm import Scene, load_scene, run
+
+ROOT = Path(__file__).parent.parent
+sys.path.append(str(ROOT / "scenes" / "textures"))  # for the modules that make_frame.py imports
+
+from scenes.textures.make_frame import CAMERA, SIDE, SIZE, UNIT, write_wall  # noqa: E402
+
+Floats = NDArray[np.float64]
+
+PAGE = ROOT / "docs" / "frame.md"
+
+TISSUE = load_scene(ROOT / "scenes" / "frame.yaml").tissue
+RADIUS, PRESSED = 0.005, 0.005  # of the ball, and its depth [m]
+AT = 0.012, -0.012  # x and y of the place [m]
+NEAR = 3 * RADIUS  # radius of the part that is compared [m]
+
+# Mass points of the wall, and of most sheets from its frame, whose cells are about as large.
+WALL, SHEET = (241, 241), (121, 151)
+COARSE_STEP = 8e-4  # of depths [m]
+SMOOTH = 6  # standard deviation of more smoothing [px]
+
+
+class View:
+    """The camera of a run, and the surface that it sees."""
+
+    def __init__(self, folder: Path) -> None:
+        camera = json.loads((folder / "camera.json").read_text())
+        self.focal, self.pose = camera["intrinsics"][0][0], np.array(camera["pose"])
+        with Image.open(folder / "depth" / "0000.tiff") as depths:
+            self.depth = np.asarray(depths, dtype=np.float64)
+
+    def pixels(self, points: Floats) -> Floats:
+        """Project points [m], shape (n, 3), to pixels from the picture's corner, shape (n, 2)."""
+        x, y, z = self.pose[:, :3] @ points.T + self.pose[:, 3:]
+        return np.stack([self.focal * x / z + SIZE[0] / 2, self.focal * y / z + SIZE[1] / 2], axis=1)
+
+    def seen(self, pixels: Floats) -> Floats:
+        """Return the points of the surface at pixels [m], shape (n, 3)."""
+        z = 1 / map_coordinates(1 / self.depth, pixels.T[::-1] - 0.5, order=3, mode="nearest")
+        rays = np.column_stack([(pixels - np.array(SIZE) / 2) / self.focal, np.ones(len(pixels))])
+        return (rays * z[:, None] - self.pose[:, 3]) @ self.pose[:, :3]
+
+
+class Pressed(NamedTuple):
+    """A sheet at rest and pressed: positions [m] and normals, shape (n, 3), of its mass points, and the force [N]."""
+
+    rest: Floats
+    normal: Floats
+    moved: Floats
+    force: Floats
+
+
+def ball(across: float, down: float) -> dict[str, Any]:
+    """Return the probe, which comes from behind the camera."""
+    path = [[0, across, down, 0.15], [0.5, across, down, 0.002], [1, across, down, -PRESSED]]
+    return {"path": path, "instrument": {"radius": RADIUS, "shaft": [0.3, -0.3, 0.9], "length": 0.1}}
+
+
+def press(folder: Path, across: float, down: float, **sections: Any) -> Pressed:
+    """Press a sheet with the ball at a place."""
+    time = {"duration": 1, "frames_per_second": 4, "motion": "quasistatic"}
+    scene = Scene(tissue=TISSUE, probes=[ball(across, down)], time=time, **sections)
+    (tool,) = run(scene, folder, estimate_error=False)["probes"]
+    with np.load(folder / "rest.npz") as rest, np.load(folder / "trajectory.npz") as trajectory:
+        arrays = rest["position"], rest["normal"], trajectory["position"][-1]
+        return Pressed(*(array.reshape(-1, 3) for array in arrays), np.array(tool["greatest_force_vector"]))
+
+
+class Trip:
+    """The wall, and sheets from its frame."""
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+        wall = write_wall(folder)
+        heights = np.load(folder / "wall.npy")
+        count = len(heights) // 4
+        axis = ((np.arange(count) + 0.5) / count - 0.5) * SIDE
+        z = heights.reshape(count, 4, count, 4).mean(axis=(1, 3))
+        np.save(folder / "wall.npy", np.stack([*np.meshgrid(axis, -axis), z], axis=-1))
+        surface = {"points": {"file": str(folder / "wall.npy"), "unit": "m"}, "grid": "even"}
+        self.sections = {"image": wall["image"], "render": wall["render"], "output": ["png", "depth", "trajectory"]}
+        self.sheet: dict[str, Any] = {"points": WALL, "surface": surface, "fixed": "border"}
+        run(self._scene_at_rest(), folder / "rest", estimate_error=False)
+        self.view = View(folder / "rest")
+        with np.load(folder / "rest" / "rest.npz") as rest:
+            position = rest["position"]
+        row, col = np.unravel_index(np.hypot(*(position[..., :2] - AT).T).T.argmin(), WALL)
+        self.place = position[row, col]
+        self.fractions = col / (WALL[1] - 1), row / (WALL[0] - 1)
+        self.whole = press(folder / "whole", *self.fractions, sheet=self.sheet, **self.sections)
+        near = np.linalg.norm(self.whole.rest - self.place, axis=1) < 2 * NEAR
+        values = np.hstack([self.whole.moved - self.whole.rest, self.whole.normal])[near]
+        self.of_wall = CloughTocher2DInterpolator(self.whole.rest[near, :2], values)
+
+    def _scene_at_rest(self) -> Scene:
+        time = {"duration": 1, "frames_per_second": 1, "motion": "quasistatic"}
+        return Scene(tissue=TISSUE, time=time, sheet=self.sheet, **self.sections)
+
+    def visible_part(self) -> Pressed:
+        """Press the wall without its part outside the frame, where it is fixed."""
+        position = self.whole.rest.reshape(*WALL, 3)
+        middle = (position[1:, 1:] + position[1:, :-1] + position[:-1, 1:] + position[:-1, :-1]) / 4
+        pixels = self.view.pixels(middle.reshape(-1, 3))
+        is_seen = ((pixels > 0) & (pixels < SIZE)).all(axis=1).reshape(middle.shape[:2])
+        Image.fromarray(np.where(is_seen, 255, 0).astype(np.uint8)).save(self.folder / "mask.png")
+        sheet = {**self.sheet, "mask": str(self.folder / "mask.png"), "fixed": "outline"}
+        return press(self.folder / "part", *self.fractions, sheet=sheet, **self.sections)
+
+    def from_frame(
+        self, depth: Floats, unit: float = 1, points: tuple[int, int] = SHEET, grid: str = "even", **keys: Any
+    ) -> Pressed:
+        """Press the sheet of the frame and a depth in a unit [m]."""
+        np.save(self.folder / "depth.npy", depth)
+        across, down = self.view.pixels(self.place[None])[0] / SIZE
+        surface = {"depth": {"file": str(self.folder / "depth.npy"), "unit": unit, **keys}, "grid": grid}
+        return press(
+            self.folder / f"sheet{len(list(self.folder.iterdir()))}",
+            across,
+            down,
+            image=str(self.folder / "rest" / "frames" / "0000.png"),
+            sheet={"points": points, "surface": surface, "fixed": "border"},
+            render={"camera": CAMERA},
+            output=["trajectory"],
+        )
+
+    def row(self, name: str, pressed: Pressed) -> list[str]:
+        """Return the errors of a sheet near the ball, against the whole wall."""
+        near = np.linalg.norm(pressed.rest - self.place, axis=1) < NEAR
+        near &= np.linalg.norm(pressed.normal, axis=1) > 0.5  # mass points without a cell have no normal
+        rest, moved = pressed.rest[near], pressed.moved[near]
+        pixels = self.view.pixels(rest)
+        true_rest = self.view.seen(pixels)
+        motion, normal = np.hsplit(self.of_wall(true_rest[:, :2]), 2)
+        surface = np.abs(((moved - true_rest - motion) * normal).sum(axis=1))
+        error = np.linalg.norm(moved - rest - motion, axis=1)
+        flow = np.linalg.norm(self.view.pixels(moved) - self.view.pixels(true_rest + motion), axis=1)
+        force, true_force = np.linalg.norm(pressed.force), np.linalg.norm(self.whole.force)
+        columns = (1000 * np.linalg.norm(rest - true_rest, axis=1), 1000 * surface, 1000 * error)
+        return [
+            name,
+            *(f"{values.mean():.3f}, {values.max():.3f} mm" for values in columns),
+            f"{flow.mean():.2f}, {flow.max():.2f} px",
+            f"{100 * (force / true_force - 1):+.1f} %",
+        ]
+
+
+def round_trip() -> str:
+    """Return the table of the errors of sheets from a frame."""
+    with TemporaryDirectory() as name:
+        trip = Trip(Path(name))
+        depth = trip.view.depth
+        counts = np.rint(depth / UNIT).astype(np.uint16)
+        coarse = np.rint(depth / COARSE_STEP).astype(np.uint16)
+        head = ["sheet", "rest", "pressed surface", "displacement", "flow", "force"]
+        row, sheet = trip.row, trip.from_frame
+        rows = [
+            row("the wall without the part outside the frame", trip.visible_part()),
+            row("from the frame, depth exact, `smooth: 0`, `grid: given`", sheet(depth, grid="given", smooth=0)),
+            row("`grid: even`", sheet(depth, smooth=0)),
+            row("`smooth: auto`", sheet(depth)),
+            row("depth in 16 bits, steps of 0.02 mm", sheet(counts, UNIT)),
+            row("65 x 81 points", sheet(counts, UNIT, (65, 81))),
+            row("depth in steps of 0.8 mm", sheet(coarse, COARSE_STEP)),
+            row(f"`smooth: {SMOOTH}`", sheet(coarse, COARSE_STEP, smooth=SMOOTH)),
+        ]
+        force = np.linalg.norm(trip.whole.force)
+        print(f"{force:.3f} N at {trip.place} m")
+        return table(head, rows)
+
+
+def main() -> None:
+    """Write the tables of the page."""
+    text = round_trip()
+    print(text)
+    page = PAGE.read_text(encoding="utf-8")
+    PAGE.write_text(replace_marked(page, "trip", "docs/make_frame.py", text + "\n"), encoding="utf-8")
+
+
+if __name__ == "__main__":
+    main()
