@@ -134,7 +134,7 @@ def _is_visible(camera: View, pixels: NDArray[np.float64], scene: Scene) -> bool
 def _stretched_picture(scene: Scene) -> Iterator[str]:
     """Warn of a picture that is stretched onto the sheet, with two remedies."""
     size = texture.image_size(scene)
-    if size is None or (scene.sheet.surface and scene.sheet.surface.points):
+    if size is None or (scene.sheet.surface and scene.sheet.surface.has_own_size):
         return
     left, top, width, height = scene.region or (0, 0, *size)
     sheet_height, sheet_width = scene.sheet.size

@@ -76,6 +76,8 @@ def _shade(entry, left, top, texels: ti.template(), band: ti.template()):
             light = _relative_light(light, entry, is_covered, texels, band)
         for n in ti.static(range(3)):
             colour[n] *= light
+            if ti.static(config.is_relit):
+                colour[n] = ti.min(colour[n], 255.0)
     x, y = undistorted_centres(left, top, entry, band)
     normal = [samples[entry + (plane.normal_x + n)] for n in ti.static(range(3 * (config.tissue or config.metal)))]
     if ti.static(config.tissue):
