@@ -1,19 +1,19 @@
-"""Press a wall, and the sheet that its frame and depth become, and compare both, for docs/frame.md.
+"""Press a wall, and sheets from its frame and depth, compare them, and measure OpenCV's depth, for docs/frame.md.
 
     PYTHONPATH=. python docs/make_frame.py
 
-Needs OpenCV, for the depth of a stereo pair. Takes about two minutes.
+Needs OpenCV (extra `bench`). Takes about two minutes.
 """
 
 from __future__ import annotations
 
 import json
+import subprocess
 import sys
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any, NamedTuple
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
@@ -41,6 +41,7 @@ NEAR = 3 * RADIUS  # radius of the part that is compared [m]
 WALL, SHEET = (241, 241), (121, 151)
 COARSE_STEP = 8e-4  # of depths [m]
 SMOOTH = 6  # standard deviation of more smoothing [px]
+BASELINE = 0.004  # of the stereo pair on the page [m]
 
 
 class View:
@@ -103,7 +104,7 @@ class Trip:
         surface = {"points": {"file": str(folder / "wall.npy"), "unit": "m"}, "grid": "even"}
         self.sections = {"image": wall["image"], "render": wall["render"], "output": ["png", "depth", "trajectory"]}
         self.sheet: dict[str, Any] = {"points": WALL, "surface": surface, "fixed": "border"}
-        run(self._scene_at_rest(), folder / "rest", estimate_error=False)
+        run(self.at_rest(), folder / "rest", estimate_error=False)
         self.view = View(folder / "rest")
         with np.load(folder / "rest" / "rest.npz") as rest:
             position = rest["position"]
@@ -115,7 +116,8 @@ class Trip:
         values = np.hstack([self.whole.moved - self.whole.rest, self.whole.normal])[near]
         self.of_wall = CloughTocher2DInterpolator(self.whole.rest[near, :2], values)
 
-    def _scene_at_rest(self) -> Scene:
+    def at_rest(self) -> Scene:
+        """Return the scene of the wall without the ball."""
         time = {"duration": 1, "frames_per_second": 1, "motion": "quasistatic"}
         return Scene(tissue=TISSUE, time=time, sheet=self.sheet, **self.sections)
 
@@ -167,36 +169,75 @@ class Trip:
         ]
 
 
-def round_trip() -> str:
-    """Return the table of the errors of sheets from a frame."""
+def draw_pair(scene: Scene, folder: Path) -> None:
+    """Draw a scene at rest, without its tools, as the stereo pair of the page."""
+    render = scene.render.model_dump(mode="json", exclude_unset=True)
+    cameras = {"left": render.pop("camera"), "right": {"beside": "left", "baseline": BASELINE}}
+    sections = scene.model_dump(mode="json", exclude_unset=True, include={"image", "sheet", "tissue"})
+    time = {"duration": 1, "frames_per_second": 1, "motion": "quasistatic"}
+    pair = Scene(**sections, time=time, render={**render, "cameras": cameras}, output=["png", "depth"])
+    run(pair, folder / "output" / "pair", estimate_error=False)
+
+
+def match(folder: Path) -> Floats:
+    """Return OpenCV's depth of a pair [m], 0 where there is none, by the code of the page."""
+    code = PAGE.read_text(encoding="utf-8").split("```py\n")[1].split("```")[0]
+    subprocess.run([sys.executable, "-c", code], cwd=folder, check=True)
+    depth: Floats = np.load(folder / "depth.npy")
+    return depth
+
+
+def match_row(name: str, scene: Scene, folder: Path) -> tuple[Floats, list[str]]:
+    """Return OpenCV's depth of a scene as a pair [m], and the row of its errors."""
+    draw_pair(scene, folder)
+    depth = match(folder)
+    with Image.open(folder / "output" / "pair" / "left" / "depth" / "0000.tiff") as depths:
+        errors = 1000 * np.abs(depth - np.asarray(depths))[depth > 0]
+    missing = 100 * np.mean(depth == 0)
+    return depth, [name, f"{missing:.0f} %", f"{np.median(errors):.2f} mm", f"{np.quantile(errors, 0.95):.2f} mm"]
+
+
+def tables() -> tuple[str, str]:
+    """Return the tables of the errors of sheets from a frame, and of OpenCV's depth."""
     with TemporaryDirectory() as name:
         trip = Trip(Path(name))
         depth = trip.view.depth
         counts = np.rint(depth / UNIT).astype(np.uint16)
         coarse = np.rint(depth / COARSE_STEP).astype(np.uint16)
-        head = ["sheet", "rest", "pressed surface", "displacement", "flow", "force"]
+        _, shipped = match_row("`frame.yaml`", load_scene(ROOT / "scenes" / "frame.yaml"), Path(name))
+        matched, wall = match_row("the wall above, with highlights", trip.at_rest(), Path(name))
         row, sheet = trip.row, trip.from_frame
         rows = [
-            row("the wall without the part outside the frame", trip.visible_part()),
+            row("the wall, cut off at the frame's border", trip.visible_part()),
             row("from the frame, depth exact, `smooth: 0`, `grid: given`", sheet(depth, grid="given", smooth=0)),
             row("`grid: even`", sheet(depth, smooth=0)),
-            row("`smooth: auto`", sheet(depth)),
-            row("depth in 16 bits, steps of 0.02 mm", sheet(counts, UNIT)),
-            row("65 x 81 points", sheet(counts, UNIT, (65, 81))),
+            row("`smooth: auto`, 1.6 px", sheet(depth)),
+            row("depth in steps of 0.02 mm (16 bits)", sheet(counts, UNIT)),
             row("depth in steps of 0.8 mm", sheet(coarse, COARSE_STEP)),
-            row(f"`smooth: {SMOOTH}`", sheet(coarse, COARSE_STEP, smooth=SMOOTH)),
+            row(f"the same, `smooth: {SMOOTH}`", sheet(coarse, COARSE_STEP, smooth=SMOOTH)),
+            row("depth of OpenCV, below, `smooth: auto`", sheet(matched)),
+            row("depth in steps of 0.02 mm, 65 x 81 points, 3 px", sheet(counts, UNIT, (65, 81))),
         ]
-        force = np.linalg.norm(trip.whole.force)
-        print(f"{force:.3f} N at {trip.place} m")
-        return table(head, rows)
+        print(f"{np.linalg.norm(trip.whole.force):.3f} N at {trip.place} m")
+    trip_head = ["sheet", "depth", "surface", "displacement", "flow", "force"]
+    return table(trip_head, rows), table(["frames", "without depth", "median error", "95 % below"], [shipped, wall])
+
+
+def check_lines() -> str:
+    """Return the lines of `taichi-msm check` on the surface of the shipped scene."""
+    command = [sys.executable, "-m", "taichi_msm", "check", "scenes/frame.yaml"]
+    printed = subprocess.run(command, cwd=ROOT, check=True, capture_output=True, text=True).stdout
+    lines = [line for line in printed.splitlines() if line.startswith("surface:")]
+    return "\n".join(["```text", *lines, "```", ""])
 
 
 def main() -> None:
     """Write the tables of the page."""
-    text = round_trip()
-    print(text)
+    trip, pair = tables()
     page = PAGE.read_text(encoding="utf-8")
-    PAGE.write_text(replace_marked(page, "trip", "docs/make_frame.py", text + "\n"), encoding="utf-8")
+    for part, text in (("check", check_lines()), ("trip", trip + "\n"), ("pair", pair + "\n")):
+        page = replace_marked(page, part, "docs/make_frame.py", text)
+    PAGE.write_text(page, encoding="utf-8")
 
 
 if __name__ == "__main__":
