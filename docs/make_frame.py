@@ -34,13 +34,14 @@ PAGE = ROOT / "docs" / "frame.md"
 
 TISSUE = load_scene(ROOT / "scenes" / "frame.yaml").tissue
 RADIUS, PRESSED = 0.005, 0.005  # of the ball, and its depth [m]
-AT = 0.012, -0.012  # x and y of the place [m]
+PLACES = (0.012, -0.012), (0.039, 0.004)  # x and y [m]: in the middle of the frame, near its right border
 NEAR = 3 * RADIUS  # radius of the part that is compared [m]
 
 # Mass points of the wall, and of most sheets from its frame, whose cells are about as large.
 WALL, SHEET = (241, 241), (121, 151)
 COARSE_STEP = 8e-4  # of depths [m]
 SMOOTH = 6  # standard deviation of more smoothing [px]
+CUT, OF_OPENCV = 48, 3  # columns of pixels at the left without OpenCV's depth, and its smoothing [px]
 BASELINE = 0.004  # of the stereo pair on the page [m]
 
 
@@ -93,8 +94,9 @@ def press(folder: Path, across: float, down: float, **sections: Any) -> Pressed:
 class Trip:
     """The wall, and sheets from its frame."""
 
-    def __init__(self, folder: Path) -> None:
+    def __init__(self, folder: Path, at: tuple[float, float]) -> None:
         self.folder = folder
+        folder.mkdir()
         wall = write_wall(folder)
         heights = np.load(folder / "wall.npy")
         count = len(heights) // 4
@@ -108,7 +110,7 @@ class Trip:
         self.view = View(folder / "rest")
         with np.load(folder / "rest" / "rest.npz") as rest:
             position = rest["position"]
-        row, col = np.unravel_index(np.hypot(*(position[..., :2] - AT).T).T.argmin(), WALL)
+        row, col = np.unravel_index(np.hypot(*(position[..., :2] - at).T).T.argmin(), WALL)
         self.place = position[row, col]
         self.fractions = col / (WALL[1] - 1), row / (WALL[0] - 1)
         self.whole = press(folder / "whole", *self.fractions, sheet=self.sheet, **self.sections)
@@ -121,6 +123,15 @@ class Trip:
         time = {"duration": 1, "frames_per_second": 1, "motion": "quasistatic"}
         return Scene(tissue=TISSUE, time=time, sheet=self.sheet, **self.sections)
 
+    @property
+    def border_distance(self) -> float:
+        """Distance of the place to the visible surface at the frame's border [m]."""
+        width, height = SIZE
+        across, down = np.arange(width) + 0.5, np.arange(height) + 0.5
+        border = [(across, 0.5), (across, height - 0.5), (0.5, down), (width - 0.5, down)]
+        pixels = np.concatenate([np.column_stack(np.broadcast_arrays(x, y)) for x, y in border])
+        return float(np.linalg.norm(self.view.seen(pixels) - self.place, axis=1).min())
+
     def visible_part(self) -> Pressed:
         """Press the wall without its part outside the frame, where it is fixed."""
         position = self.whole.rest.reshape(*WALL, 3)
@@ -132,17 +143,19 @@ class Trip:
         return press(self.folder / "part", *self.fractions, sheet=sheet, **self.sections)
 
     def from_frame(
-        self, depth: Floats, unit: float = 1, points: tuple[int, int] = SHEET, grid: str = "even", **keys: Any
+        self, depth: Floats, unit: float = 1, points: tuple[int, int] = SHEET, left: int = 0, **keys: Any
     ) -> Pressed:
-        """Press the sheet of the frame and a depth in a unit [m]."""
+        """Press the sheet of the frame, without some columns of pixels at its left, and a depth in a unit [m]."""
         np.save(self.folder / "depth.npy", depth)
-        across, down = self.view.pixels(self.place[None])[0] / SIZE
+        grid = keys.pop("grid", "even")
+        across, down = (self.view.pixels(self.place[None])[0] - (left, 0)) / (SIZE[0] - left, SIZE[1])
         surface = {"depth": {"file": str(self.folder / "depth.npy"), "unit": unit, **keys}, "grid": grid}
         return press(
             self.folder / f"sheet{len(list(self.folder.iterdir()))}",
             across,
             down,
             image=str(self.folder / "rest" / "frames" / "0000.png"),
+            region=(left, 0, SIZE[0] - left, SIZE[1]),
             sheet={"points": points, "surface": surface, "fixed": "border"},
             render={"camera": CAMERA},
             output=["trajectory"],
@@ -200,7 +213,7 @@ def match_row(name: str, scene: Scene, folder: Path) -> tuple[Floats, list[str]]
 def tables() -> tuple[str, str]:
     """Return the tables of the errors of sheets from a frame, and of OpenCV's depth."""
     with TemporaryDirectory() as name:
-        trip = Trip(Path(name))
+        trip, at_border = (Trip(Path(name) / f"{n}", at) for n, at in enumerate(PLACES))
         depth = trip.view.depth
         counts = np.rint(depth / UNIT).astype(np.uint16)
         coarse = np.rint(depth / COARSE_STEP).astype(np.uint16)
@@ -208,15 +221,19 @@ def tables() -> tuple[str, str]:
         matched, wall = match_row("the wall above, with highlights", trip.at_rest(), Path(name))
         row, sheet = trip.row, trip.from_frame
         rows = [
-            row("the wall, cut off at the frame's border", trip.visible_part()),
+            row(f"the wall, cut off at the border, {1000 * trip.border_distance:.0f} mm away", trip.visible_part()),
             row("from the frame, depth exact, `smooth: 0`, `grid: given`", sheet(depth, grid="given", smooth=0)),
             row("`grid: even`", sheet(depth, smooth=0)),
             row("`smooth: auto`, 1.6 px", sheet(depth)),
             row("depth in steps of 0.02 mm (16 bits)", sheet(counts, UNIT)),
             row("depth in steps of 0.8 mm", sheet(coarse, COARSE_STEP)),
             row(f"the same, `smooth: {SMOOTH}`", sheet(coarse, COARSE_STEP, smooth=SMOOTH)),
-            row("depth of OpenCV, below, `smooth: auto`", sheet(matched)),
-            row("depth in steps of 0.02 mm, 65 x 81 points, 3 px", sheet(counts, UNIT, (65, 81))),
+            row(f"depth of OpenCV (below), `smooth: {OF_OPENCV}`", sheet(matched, left=CUT, smooth=OF_OPENCV)),
+            row("depth in steps of 0.02 mm, 65 x 81 points", sheet(counts, UNIT, (65, 81))),
+            at_border.row(
+                f"the same, {1000 * at_border.border_distance:.0f} mm from the border",
+                at_border.from_frame(np.rint(at_border.view.depth / UNIT).astype(np.uint16), UNIT, (65, 81)),
+            ),
         ]
         print(f"{np.linalg.norm(trip.whole.force):.3f} N at {trip.place} m")
     trip_head = ["sheet", "depth", "surface", "displacement", "flow", "force"]
