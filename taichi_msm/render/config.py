@@ -40,7 +40,7 @@ from functools import cache
 from typing import Any, NamedTuple
 
 from taichi_msm.render import uniforms as uni
-from taichi_msm.render.labels import LABELS, values_per_pixel
+from taichi_msm.render.labels import WRITTEN, values_per_pixel
 from taichi_msm.system.runtime import ti
 
 # Maximum number of samples in a row of a tile.
@@ -173,7 +173,7 @@ class DrawingConfig(NamedTuple):
 def _planes(config: DrawingConfig) -> Any:
     """Return the index of each plane that a configuration needs, by name."""
     needed = {
-        **{plane: name in config.labels for name, label in LABELS.items() for plane in label.planes},
+        **{plane: name in config.labels for name, label in WRITTEN.items() for plane in label.planes},
         **dict.fromkeys(("depth", "texel_x", "texel_y"), True),  # of the visible surface; texture coordinates [texels]
         "light": config.headlit,  # reflected share of the headlight
         "wire": config.wireframe,  # opacity of the mesh's lines

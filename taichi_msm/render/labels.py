@@ -54,14 +54,16 @@ class Label(NamedTuple):
     is_optional: bool = False  # whether the label is written only on request
 
 
-# The fields of `Labels` and `PicturedLabels`.
+# The fields of `Labels`.
 LABELS = {
     "coordinates": Label(("across", "down"), math.nan, sheet_only=True, dtype=np.float32),
     "depth": Label(("depth",), 0.0, sheet_only=False, dtype=np.float32),
     "instrument": Label(("instrument",), 0.0, sheet_only=False, dtype=np.uint8),
     "normals": Label(("facet_x", "facet_y", "facet_z"), math.nan, sheet_only=False, dtype=np.float32, is_optional=True),
-    "mesh": Label(("mesh_across", "mesh_down"), math.nan, sheet_only=True, dtype=np.float32, is_optional=True),
 }
+
+# All labels that kernel 2 writes: with a picture by a camera also `PicturedLabels.mesh`.
+WRITTEN = {**LABELS, "mesh": Label(("mesh_across", "mesh_down"), math.nan, sheet_only=True, dtype=np.float32)}
 
 
 def requested_labels(outputs: Collection[str]) -> frozenset[str]:
@@ -72,7 +74,7 @@ def requested_labels(outputs: Collection[str]) -> frozenset[str]:
 def _label_offsets(names: Collection[str]) -> Iterator[tuple[str, Label, int]]:
     """Yield the name, the label and its offset [values per pixel] of the labels of these names."""
     offset = 0
-    for name, label in LABELS.items():
+    for name, label in WRITTEN.items():
         if name in names:
             yield name, label, offset
             offset += len(label.planes)
@@ -80,7 +82,7 @@ def _label_offsets(names: Collection[str]) -> Iterator[tuple[str, Label, int]]:
 
 def values_per_pixel(names: Collection[str]) -> int:
     """Return the number of values per pixel of labels."""
-    return sum(len(LABELS[name].planes) for name in names)
+    return sum(len(WRITTEN[name].planes) for name in names)
 
 
 class Channel(NamedTuple):

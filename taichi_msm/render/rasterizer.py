@@ -43,7 +43,7 @@ def drawing_config(
     tissue = picture and render.shading == "tissue"
     rest = rest_of(scene.sheet)
     picture_lens = rest.picture.view.lens_model if isinstance(rest, PicturedRest) else None
-    labels = frozenset(labels) - {"mesh"} | ({"mesh"} if labels and picture_lens is not None else set())
+    mesh = frozenset({"mesh"} if labels and picture_lens is not None else ())
     return DrawingConfig(
         refined=render.refine > 0,
         masked=scene.sheet.mask is not None,
@@ -56,7 +56,7 @@ def drawing_config(
         shapes=scene.shapes,
         metal=picture and bool(scene.shapes),
         picture=picture,
-        labels=labels,
+        labels=mesh.union(labels),
         lens=view_at(scene, 0.0).lens_model if lens is None else lens,
         lanes=lanes("f32"),
         picture_lens=picture_lens,
@@ -162,6 +162,8 @@ def _reference_light(scene: Scene, texture: NDArray[np.uint8], config: DrawingCo
         rows, columns = distance_transform_edt(is_missing, return_distances=False, return_indices=True)
         return (light[rows, columns],)
 
-    hashes = [sha256(np.ascontiguousarray(array)).digest() for array in (rest.position, rest.present, texture)]
-    key = "light", *hashes, texture.shape, config, render.refine, render.light, str(view)
+    hashes = [
+        sha256(array.tobytes()).digest() for array in (rest.position, rest.present, texture, view.matrix)
+    ]
+    key = "light", *hashes, texture.shape, config, render.refine, render.light, view.optics, view.distance
     return cached_arrays(key, draw)[0]

@@ -163,7 +163,8 @@ class Renderer:
         if key not in self._rasterizers:
             from taichi_msm.render.rasterizer import Rasterizer, drawing_config
 
-            scene = self.scene if style is None else self.scene.model_copy(update={"render": style})
+            scene, sheet = self.scene, self.scene.sheet.with_kept_frame()
+            scene = scene if style is None else scene.model_copy(update={"render": style, "sheet": sheet})
             texture = np.zeros((1, 1, 3), np.uint8)
             if picture:
                 texture = self._texture = load_texture(self.scene) if self._texture is None else self._texture

@@ -427,6 +427,15 @@ def _texels_around(first, width, height, x, y, config: ti.template()):
 
 
 @ti.func
+def _grey(first, width, height, x, y, texels: ti.template(), config: ti.template()):
+    """Interpolate the grey level of a level, as `_texels_around`, bilinearly at column x and row y."""
+    ul, ur, ll, lr, u, v = _texels_around(first, width, height, x, y, config)
+    corners = [_fetch_rgb(index, texels, config) for index in ti.static((ul, ur, ll, lr))]
+    grey = [(corner[0] + corner[1] + corner[2]) * (1.0 / 3.0) for corner in ti.static(corners)]
+    return _bilinear(grey[0], grey[1], grey[2], grey[3], u, v)
+
+
+@ti.func
 def _fetch(first, width, height, x, y, texels: ti.template(), config: ti.template()):
     """Interpolate a level, as `_texels_around`, bilinearly at column x and row y.
 
@@ -436,7 +445,14 @@ def _fetch(first, width, height, x, y, texels: ti.template(), config: ti.templat
     ul, ur = _fetch_rgb(upper_left, texels, config), _fetch_rgb(upper_right, texels, config)
     ll, lr = _fetch_rgb(lower_left, texels, config), _fetch_rgb(lower_right, texels, config)
     slope_x, slope_y = u, v
-    if ti.static(config.relief):
+    if ti.static(config.relief and config.is_pictured):
+        # Between texels half a texel away: at the centres of texels, where the light of the picture is sampled, the
+        # gradient of bilinear interpolation jumps.
+        slope_x = _grey(first, width, height, x + 0.5, y, texels, config)
+        slope_x = slope_x - _grey(first, width, height, x - 0.5, y, texels, config)
+        slope_y = _grey(first, width, height, x, y + 0.5, texels, config)
+        slope_y = slope_y - _grey(first, width, height, x, y - 0.5, texels, config)
+    elif ti.static(config.relief):
         grey_ul, grey_ur = ul[0] + ul[1] + ul[2], ur[0] + ur[1] + ur[2]
         grey_ll, grey_lr = ll[0] + ll[1] + ll[2], lr[0] + lr[1] + lr[2]
         slope_x = (grey_ur - grey_ul + (grey_lr - grey_ll - (grey_ur - grey_ul)) * v) * (1.0 / 3.0)

@@ -48,8 +48,9 @@ NOT_VISIBLE = math.nan
 def locate_points(scene: Scene, coordinates: Array, shot: Shot) -> Sight:
     """Project material points, with coordinates as in `Labels`, shape (n, 2), and determine their occlusion."""
     rest = rest_of(scene.sheet)
-    pixels, hidden = _track(scene, rest.mesh_places(coordinates), shot)
-    is_missing = ~rest.covers(coordinates, COORDINATE_TOLERANCE)
+    places = np.asarray(coordinates, float)
+    pixels, hidden = _track(scene, rest.mesh_places(places), shot)
+    is_missing = ~rest.covers(places, COORDINATE_TOLERANCE)
     pixels[is_missing], hidden[is_missing] = NOT_VISIBLE, True
     return Sight(pixels, hidden.view(np.bool_))
 
@@ -62,7 +63,7 @@ def mesh_of(scene: Scene, labels: Labels) -> Array:
     if isinstance(labels, PicturedLabels):
         return labels.mesh
     on_sheet, mesh = ~np.isnan(coordinates[..., 0]), np.full(coordinates.shape, np.nan)
-    mesh[on_sheet] = rest.mesh_places(coordinates[on_sheet])
+    mesh[on_sheet] = rest.mesh_places(coordinates[on_sheet].astype(float))
     return mesh
 
 

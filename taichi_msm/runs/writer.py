@@ -185,7 +185,7 @@ class LabelWriter:
         # Tracks stay in memory until `finish`, as their arrays are ordered by track, not by frame.
         rest = rest_of(scene.sheet)
         self._grid = track_grid(scene.render.tracks, rest)
-        self._mesh = rest.mesh_places(self._grid).clip(0, 1)
+        self._mesh = rest.mesh_places(self._grid.astype(float)).clip(0, 1)
         shape = len(self._grid) if scene.asks_for("tracks") else 0, scene.time.frames + 1
         self._pixels, self._occluded = np.empty((*shape, 2), np.float32), np.empty(shape, np.bool_)
         self._position = np.empty((*shape, 3), np.float32)

@@ -36,7 +36,7 @@ class Viewport:
     def set_camera(self, camera: AnyCamera) -> None:
         """Set the main camera; the other cameras of the rig move with it."""
         if isinstance(camera, Camera) and not self._plays:
-            camera = frozen_camera(camera, 0.0)
+            camera = frozen_camera(camera, self._renderer.scene, 0.0)
         self.render = self.render.with_main(camera)
         self.view = view(self._scene().model_copy(update={"output": ()}), self._time)
 

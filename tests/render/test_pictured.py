@@ -115,7 +115,7 @@ def assert_is_picture(made: Scene, least_share: float = 1.0, **config: Any) -> N
 
 
 # Sides of cells are straight, those of a picture by a lens are not: at its border, pixels may show no sheet.
-@pytest.mark.default_cases("pinhole-none", "fisheye-tissue", "scaramuzza-headlight", "omnidir-none", "rational-tissue")
+@pytest.mark.default_cases("pinhole-none", "fisheye-tissue", "scaramuzza-headlight")
 @pytest.mark.parametrize("shading", ["none", "headlight", "tissue"])
 @pytest.mark.parametrize("lens", CAMERAS)
 def test_frame_at_rest_is_the_picture(lens: str, shading: str, device: Device) -> None:
@@ -125,7 +125,7 @@ def test_frame_at_rest_is_the_picture(lens: str, shading: str, device: Device) -
 
 
 def test_frame_at_rest_with_an_even_grid_or_points_is_the_picture(device: Device) -> None:
-    even = pictured(grid="even", render={"shading": "tissue"})
+    even = pictured(grid="even")
     assert_is_picture(even)
     np.save("points.npy", rest_of(even.sheet).position)
     surface = {"points": {"file": "points.npy", "unit": "m"}, "picture": "main"}
@@ -137,7 +137,7 @@ def test_frame_at_rest_with_an_even_grid_or_points_is_the_picture(device: Device
 
 def test_frame_at_rest_is_the_region_of_the_picture(device: Device) -> None:
     x, y, width, height = region = [20, 10, 50, 40]
-    made = pictured(CAMERAS["fisheye"], region=region, render={"shading": "tissue"})
+    made = pictured(CAMERAS["fisheye"], region=region)
     frame, picture = draw_at_rest(made), speckle(HEIGHT, WIDTH)
     # Pixels at the region's edge may show no sheet.
     np.testing.assert_allclose(
@@ -155,6 +155,14 @@ def test_frame_at_rest_of_half_the_size_is_the_reduced_picture(device: Device) -
     made = pictured(render={"shading": "tissue", "size": [WIDTH // 2, HEIGHT // 2], "supersample": 2})
     mean = speckle(HEIGHT, WIDTH).reshape(HEIGHT // 2, 2, WIDTH // 2, 2, 3).mean(axis=(1, 3))
     np.testing.assert_allclose(draw_at_rest(made), mean, rtol=0, atol=1)
+
+
+def test_small_motion_with_a_relief_changes_little(device: Device) -> None:
+    """By 0.005 px the bilinear picture changes by at most a level or two; the slope of the relief must not jump."""
+    made, shift = pictured(render={"shading": "tissue", "light": {"relief": 1}}), np.array([5e-3 / 80 * 0.06, 0, 0])
+    rasterizer = Rasterizer(made, load_texture(made))
+    moved = rasterizer.draw(rest_of(made.sheet).position + shift)
+    assert np.abs(moved.astype(int) - load_texture(made))[1:-1, 1:-1].max() <= 3
 
 
 def test_gloss_is_in_the_picture() -> None:
@@ -189,7 +197,7 @@ def twin_light(made: Scene, buffer: GBuffer, position: Array, camera: View) -> A
     return tissue(made, camera, one, normal, buffer.depth, (u, v, 0 * u), ())[..., 0]
 
 
-@pytest.mark.default_cases("fisheye-none", "pinhole-headlight", "rational-tissue")
+@pytest.mark.default_cases("pinhole-headlight", "rational-tissue")
 @pytest.mark.parametrize("shading", ["none", "headlight", "tissue"])
 @pytest.mark.parametrize("lens", CAMERAS)
 def test_deformed_sheet_from_another_camera_matches_the_twin(lens: str, shading: str, device: Device) -> None:
@@ -229,6 +237,7 @@ def _bilinear(values: Array, across: Array, down: Array) -> Array:
     return np.asarray(upper * (1 - t) + (values[i + 1, j] * (1 - s) + values[i + 1, j + 1] * s) * t)
 
 
+@pytest.mark.slow
 def test_gpu_form_has_the_same_bits(device: Device) -> None:
     for shading, lens in (("headlight", "scaramuzza"), ("tissue", "fisheye")):
         made = seen_aside(CAMERAS[lens], shading=shading, size=[60, 45], light={"relief": 1}, wireframe=True)
@@ -275,11 +284,11 @@ def test_places_are_located_and_picked(device: Device) -> None:
     for place in places.tolist():
         pixel = place[0] * WIDTH - 0.5, place[1] * HEIGHT - 0.5
         assert pick_at_rest(made.sheet, made.render.refine, view(made), pixel) == pytest.approx(place, abs=2e-4)
-    tracks = track_grid(5, rest)
+    tracks = track_grid(5, rest).astype(float)
     assert len(tracks) == 25
     points = surface_positions(rest.position, 4, rest.mesh_places(tracks))
     np.testing.assert_allclose(view(made).pixels(points), tracks * SIZE, rtol=0, atol=0.02)
-    corners, weights = surface_weights(tracks.astype(float), made.sheet, 4)
+    corners, weights = surface_weights(tracks, made.sheet, 4)
     interpolated = (rest.position.reshape(-1, 3)[corners] * weights[..., None]).sum(axis=1)
     np.testing.assert_allclose(interpolated, points, rtol=0, atol=1e-12)
 
@@ -301,7 +310,7 @@ def test_texture_coordinates_of_a_refined_surface() -> None:
     rest = rest_of(made.sheet)
     for count in (0, 3):
         surface = refine_surface(rest.position, count, rest)
-        pixels = posed(CAMERAS["fisheye"]).pixels(surface.vertices)
+        pixels = posed(CAMERAS["fisheye"]).pixels(surface.vertices.astype(float))
         np.testing.assert_allclose(surface.texture_coordinates, pixels / SIZE, rtol=0, atol=1e-9)
 
 
