@@ -63,7 +63,7 @@ def describe_fold(angles: Array) -> str:
 
 
 def _anisotropy(rest: CurvedRest, kind: str) -> str:
-    errors, area = rest.isotropy_errors[rest.present], rest.cells.area[rest.present]
+    errors, area = rest.isotropy_errors[rest.present], rest.present_cells.area
     share = float(area[errors > MAX_ISOTROPY_ERROR].sum() / area.sum())
     if share <= MAX_COARSE_SHARE:
         return ""
@@ -77,7 +77,7 @@ def isotropy_remedy(rest: CurvedRest, kind: str) -> str:
     """Return the numbers of points with nearly square cells, or the advice for sheared and uneven cells."""
     (p, q), (rows, cols) = rest.cell_sides, (count - 1 for count in rest.position.shape[:2])
     # Rhombi of 60 to 120 degrees are isotropic.
-    if np.median(np.abs(rest.cells.cosine[rest.present])) <= 0.5 and max(p / q, q / p) >= 1.5:
+    if np.median(np.abs(rest.present_cells.cosine)) <= 0.5 and max(p / q, q / p) >= 1.5:
         finer = (rows, round(cols * p / q)) if p > q else (round(rows * q / p), cols)
         if max(finer) < MAX_POINTS:
             return f"try sheet.points: {[count + 1 for count in finer]}, with nearly square cells"
