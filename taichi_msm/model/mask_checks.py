@@ -51,7 +51,7 @@ def place_problems(scene: Scene, rest: Rest) -> Iterator[Problem]:
     for index, probe in enumerate(scene.probes):
         if not probe.moved and (place := _place_without_sheet(probe, rest, scene.time.duration)):
             moves = isinstance(probe.at[0], tuple)
-            remedy = "two keyframes at one time jump over a hole" if moves else "move the tool onto the sheet"
+            remedy = "move the tool onto the sheet" + (", over holes by two keyframes at one time" if moves else "")
             yield Problem(("probes", index, "at"), f"{place} is on no sheet, see sheet.mask; {remedy}")
 
 
