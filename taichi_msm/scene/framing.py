@@ -27,11 +27,9 @@ def is_framed(data: Mapping[str, Any]) -> bool:
 
 def framed_image_size(data: Mapping[str, Any]) -> tuple[int, int] | None:
     """Return the size of the image of a scene, maybe invalid, whose surface has a picture by a camera [px]."""
-    image, frame = data.get("image"), _get(data, "sheet", "surface", "frame")
+    image = data.get("image")
     if not isinstance(image, str) or not is_framed(data):
         return None
-    if isinstance(frame, Frame) and frame.is_kept:
-        return frame.image_size
     try:
         return picture_size(image)
     except PictureError:
