@@ -57,9 +57,11 @@ def frames(scene_file: Path, moments: tuple[float, ...], size: tuple[int, int]) 
     return pictures
 
 
-def animation(name: str, scene: str, size: int, *overrides: str, image: Path | None = None) -> None:
-    """Write the GIF of a scene, in another size or on another picture."""
-    settings = [f"render.size=[{size},{size}]", "render.supersample=2", "output=[gif]", *overrides]
+def animation(
+    name: str, scene: str, size: int, *overrides: str, image: Path | None = None, height: int | None = None
+) -> None:
+    """Write the GIF of a scene, in another size (by default square) or on another picture."""
+    settings = [f"render.size=[{size},{height or size}]", "render.supersample=2", "output=[gif]", *overrides]
     with tempfile.TemporaryDirectory() as directory:
         run(load_scene(SCENES / f"{scene}.yaml", settings, image), directory, overrides=settings)
         shutil.copy(Path(directory) / "animation.gif", IMAGES / f"{name}.gif")
@@ -126,6 +128,34 @@ def stereo(moment: float, size: int) -> None:
         axis.axis("off")
     figure.colorbar(image, ax=axes[2])
     figure.savefig(IMAGES / "stereo.jpg", dpi=110, pil_kwargs={"quality": 90})
+
+
+def depth_frame(moment: float) -> None:
+    """Draw the frame of the scene frame, its depth, the pressed wall at a moment [s], and the flow to the next frame."""
+    scene = load_scene(SCENES / "frame.yaml", {"output": ["png", "depth", "flow"], "time.duration": moment + 0.04})
+    frame = round(moment * scene.time.frames_per_second)
+    assert scene.image is not None
+    with tempfile.TemporaryDirectory() as directory:
+        folder = Path(directory)
+        run(scene, folder, estimate_error=False)
+        files = scene.image, SCENES / "textures" / "frame-depth.png", folder / "frames" / f"{frame:04}.png"
+        picture, counts, pressed = (np.array(Image.open(file)) for file in files)
+        flow = np.fromfile(folder / "flow" / f"{frame:04}.flo", "<f4", offset=12).reshape(*counts.shape, 2)
+    figure, axes = plt.subplots(2, 2, figsize=(8.8, 6.6), layout="constrained")
+    length = np.where(np.abs(flow[..., 0]) < 1e9, np.hypot(*np.moveaxis(flow, -1, 0)), np.nan)
+    axes[0, 0].imshow(picture)
+    figure.colorbar(axes[0, 1].imshow(0.02 * counts, cmap="viridis"), ax=axes[0, 1])
+    axes[1, 0].imshow(pressed)
+    figure.colorbar(axes[1, 1].imshow(length, cmap="magma"), ax=axes[1, 1])
+    rows, columns = (index[12::24, 12::24] for index in np.indices(length.shape))
+    moves = np.nan_to_num(length[rows, columns]) > 0.3
+    x, y = columns[moves], rows[moves]
+    axes[1, 1].quiver(x, y, *flow[y, x].T, color="white", angles="xy", scale_units="xy", scale=0.15)
+    titles = "a frame", "its depth [mm]", "its wall under a probe", "a label: the flow to the next frame [px]"
+    for axis, title in zip(axes.flat, titles, strict=True):
+        axis.set_title(title)
+        axis.axis("off")
+    figure.savefig(IMAGES / "frame.jpg", dpi=90, pil_kwargs={"quality": 88})
 
 
 def forces_of(name: str) -> tuple[Floats, Floats, Floats]:
@@ -261,6 +291,8 @@ def main() -> None:
     animation("grasp", "grasp", 320)
     animation("kidney", "kidney", 320)
     animation("incision", "incision", 320)
+    animation("frame", "frame", 320, "time.frames_per_second=12.5", height=256)
+    depth_frame(0.36)
     endoscope(224)
     four_pixels()
     stereo(0.8, 400)

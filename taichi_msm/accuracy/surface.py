@@ -69,7 +69,7 @@ def surface_record(scene: Scene) -> SurfaceRecord | None:
         "sha256": file.sha256 if file else None,
         "sides": [rest.shortest_side, rest.longest_side],
         "isotropy_error": {"mean": float((errors * area).sum() / area.sum()), "worst": float(errors.max())},
-        "clamped": int(cell_stiffness(rest.cells, 1.0).is_clamped[rest.present].sum()),
+        "clamped": int(cell_stiffness(rest.present_cells, 1.0).is_clamped.sum()),
         "filled": rest.origin.filled,
     }
 
@@ -125,13 +125,13 @@ def describe_surface(plan: Plan) -> Iterator[str]:
     rest, record = rest_of(plan.scene.sheet), surface_record(plan.scene)
     if not isinstance(rest, CurvedRest) or record is None:
         return
-    (rows, cols), present = plan.scene.sheet.points, rest.present
-    side_a, side_b = rest.cells.side_a[present], rest.cells.side_b[present]
-    aspect, angles = np.maximum(side_a / side_b, side_b / side_a), np.degrees(np.arccos(rest.cells.cosine[present]))
+    (rows, cols), cells = plan.scene.sheet.points, rest.present_cells
+    ratios, angles = cells.side_a / cells.side_b, np.degrees(np.arccos(cells.cosine))
+    aspect = max(ratios.max(), 1 / ratios.min())
     low, high = f"{angles.min():.0f}", f"{angles.max():.0f}"
     yield (
         f"surface: {record['kind']}, {rows} x {cols} points, cells of {rest.shortest_side:.3g} to "
-        f"{rest.longest_side:.3g} m, at most {aspect.max():.3g} times as long as wide, with sides at "
+        f"{rest.longest_side:.3g} m, at most {aspect:.3g} times as long as wide, with sides at "
         f"{low if low == high else f'{low} to {high}'} degrees"
     )
     yield from _describe_file(rest, record)

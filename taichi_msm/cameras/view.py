@@ -90,6 +90,20 @@ class View(NamedTuple):
         w = np.where(depth == 0, np.inf, depth if self.pinhole else 1.0)
         return (self.scale[0] * self.baseline / w).astype(np.float32)
 
+    def normalise(self, points: Array) -> NDArray[np.float32]:
+        """Map points [m], shape (..., 3), to (a w, b w, w): a, b to the right and down at w = 1, w the depth [m]."""
+        x, y, w, _ = np.moveaxis(self.project(points), -1, 0)
+        a, b = (x - self.centre[0] * w) / self.scale[0], (y - self.centre[1] * w) / self.scale[1]
+        return np.stack([a, b, w], axis=-1).astype(np.float32)
+
+    def cropped(self, region: tuple[int, int, int, int], size: tuple[int, int]) -> View:
+        """Return the view of a part of the picture, (x, y, width, height) [px], resized to a width and height [px]."""
+        corner, factor = np.array(region[:2]), np.array(size) / region[2:]
+        matrix = self.matrix.copy()
+        matrix[:2] = (matrix[:2] - corner[:, None] * matrix[2]) * factor[:, None]
+        scale, centre = self.scale * factor, (self.centre - corner) * factor
+        return self._replace(matrix=matrix, scale=scale, centre=centre, size=np.array(size, float))
+
     def centred_at(self, pixel: tuple[float, float]) -> View:
         """Return a copy with X = Y = 0 along the line of sight of the centre of a pixel, (column, row) from (0, 0)."""
         matrix, centre = self.matrix.copy(), self.undistort(np.array(pixel) + 0.5)

@@ -30,7 +30,7 @@ from scipy.spatial.transform import Rotation
 from taichi_msm.errors import ProgressCallback
 from taichi_msm.exports.formats import one_folder_per_run
 from taichi_msm.exports.inputs import EXPORT_REFINE, instrument_mesh, mass_points, picture_png, unit_normals
-from taichi_msm.model.mask import Mask
+from taichi_msm.model.geometry import Rest
 from taichi_msm.model.surface import place_instruments, refine_surface
 from taichi_msm.render.camera import is_moving, view_at
 from taichi_msm.runs.directory import create_file
@@ -55,7 +55,8 @@ Numbers = NDArray[Any]
 
 
 def _write_run(run: FinishedRun, folder: Path, progress: ProgressCallback) -> list[str]:
-    positions, mask, picture = run.positions(), run.mask(), picture_png(run)
+    positions, rest, picture = run.positions(), run.rest(), picture_png(run)
+    mask = rest.mask if rest else None
     # A target has differences of positions and normals, float32.
     target_bytes = 2 * 3 * 4 * len(mass_points(positions[0], mask))
     max_targets = max(1, min(MAX_TARGETS, MAX_TARGETS_BYTES // target_bytes))
@@ -63,7 +64,7 @@ def _write_run(run: FinishedRun, folder: Path, progress: ProgressCallback) -> li
     asset = {"version": "2.0", "generator": f"taichi_msm {__version__}"}
     nodes = [{"mesh": 0, "name": "sheet"}]
     glb = Glb({"asset": asset, "scene": 0, "scenes": [{"nodes": [0]}], "nodes": nodes})
-    _add_sheet(glb, positions, mask, picture, run.time, keys, progress)
+    _add_sheet(glb, positions, rest, picture, run.time, keys, progress)
     _add_tools(glb, run, positions)
     notes = _add_cameras(glb, run)
     with create_file(folder / "surface.glb") as file:
@@ -82,14 +83,15 @@ write = one_folder_per_run(_write_run)
 def _add_sheet(
     glb: Glb,
     positions: Array,
-    mask: Mask | None,
+    rest: Rest | None,
     picture: bytes | None,
     time: Array,
     keys: KeyFrames,
     progress: ProgressCallback,
 ) -> None:
     """Add the mesh of the first frame, its material and morph targets, and their animation."""
-    first, normals = refine_surface(positions[0], EXPORT_REFINE, mask), unit_normals(positions[0], mask)
+    mask = rest.mask if rest else None
+    first, normals = refine_surface(positions[0], EXPORT_REFINE, rest), unit_normals(positions[0], mask)
     attributes = glb.attributes(first.vertices, normals)
     if picture is not None:
         attributes["TEXCOORD_0"] = glb.accessor(first.texture_coordinates, GL_ARRAY_BUFFER)

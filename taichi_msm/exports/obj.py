@@ -32,13 +32,14 @@ MATERIAL_FILE = "surface.mtl"
 
 
 def _write_run(run: FinishedRun, folder: Path, progress: ProgressCallback) -> list[str]:
-    positions, mask, picture = run.positions(), run.mask(), picture_png(run)
+    positions, rest, picture = run.positions(), run.rest(), picture_png(run)
+    mask = rest.mask if rest else None
     if picture is not None:
         write_new_file(folder / PICTURE_FILE, picture)
     # A matte material.
     material = ["newmtl sheet", "Kd 1 1 1", "Ks 0 0 0", "illum 1", *([f"map_Kd {PICTURE_FILE}"] if picture else [])]
     write_new_file(folder / MATERIAL_FILE, "".join(f"{line}\n" for line in material).encode())
-    first = refine_surface(positions[0], EXPORT_REFINE, mask)
+    first = refine_surface(positions[0], EXPORT_REFINE, rest)
     coordinates = _lines("vt", first.texture_coordinates * (1, -1) + (0, 1))
     corners = np.repeat(first.triangles + 1, 3, axis=1)
     faces = ("f %d/%d/%d %d/%d/%d %d/%d/%d\n" * len(corners)) % tuple(corners.ravel().tolist())

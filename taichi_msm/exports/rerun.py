@@ -38,7 +38,7 @@ from taichi_msm.exports.inputs import (
     read_track_positions,
     unit_normals,
 )
-from taichi_msm.model.mask import Mask
+from taichi_msm.model.geometry import Rest
 from taichi_msm.model.surface import place_instruments, refine_surface
 from taichi_msm.render.camera import calibration, is_moving, view_at
 from taichi_msm.render.labels import NO_FLOW
@@ -86,7 +86,7 @@ def _camera_runs(run: FinishedRun) -> dict[str, FinishedRun]:
 
 
 def _log_run(run: FinishedRun, recording: Any, progress: ProgressCallback) -> None:
-    positions, mask, camera_runs = run.positions(), run.mask(), _camera_runs(run)
+    positions, rest, camera_runs = run.positions(), run.rest(), _camera_runs(run)
     tracked = [camera_run for camera_run in camera_runs.values() if camera_run.has_output("tracks")]
     tracks = read_track_positions(tracked[0])[1] if tracked else None
     # Distinct colours: the hues of successive tracks are 0.618 turns apart.
@@ -99,7 +99,7 @@ def _log_run(run: FinishedRun, recording: Any, progress: ProgressCallback) -> No
         time = float(run.time[frame])
         recording.set_time("frame", sequence=frame)
         recording.set_time("time", duration=time)
-        recording.log("world/sheet", _mesh(run, position, mask, is_first=frame == 0))
+        recording.log("world/sheet", _mesh(run, position, rest, is_first=frame == 0))
         for number, solid in zip(instruments, place_instruments(run.scene, position, time), strict=True):
             if frame == 0:
                 vertices, normals, triangles = instrument_mesh(solid)
@@ -115,13 +115,14 @@ def _log_run(run: FinishedRun, recording: Any, progress: ProgressCallback) -> No
             _log_pictures(camera_run, frame, entity, recording)
 
 
-def _mesh(run: FinishedRun, position: NDArray[np.floating], mask: Mask | None, *, is_first: bool) -> Any:
+def _mesh(run: FinishedRun, position: NDArray[np.floating], rest: Rest | None, *, is_first: bool) -> Any:
     """Build the mesh of the first frame, or only vertices of a later one; the viewer keeps triangles and texture."""
+    mask = rest.mask if rest else None
     points, normals = mass_points(position, mask), unit_normals(position, mask)
     vertices: dict[str, Any] = {"vertex_positions": points, "vertex_normals": normals}
     if not is_first:
         return rerun.Mesh3D.from_fields(**vertices)
-    surface = refine_surface(position, EXPORT_REFINE, mask)
+    surface = refine_surface(position, EXPORT_REFINE, rest)
     vertices["triangle_indices"] = surface.triangles
     if run.scene.image is None:
         return rerun.Mesh3D(**vertices)

@@ -41,21 +41,22 @@ Array = NDArray[np.floating]
 
 
 def _write_run(run: FinishedRun, folder: Path, progress: ProgressCallback) -> list[str]:
-    positions, mask, picture = run.positions(), run.mask(), picture_png(run)
+    positions, rest, picture = run.positions(), run.rest(), picture_png(run)
+    mask = rest.mask if rest else None
     run.require_same_pictures(drawn=False)
-    plan, rest = make_plan(run.scene), rest_positions(run.scene.sheet)
+    plan, start = make_plan(run.scene), rest_positions(run.scene.sheet)
     collection = Element("VTKFile", type="Collection", version="0.1")
     files = SubElement(collection, "Collection")
     for frame, seconds in enumerate(run.time.tolist()):
         progress(frame, run.frames)
-        displacement, name = positions[frame] - rest, f"{frame:04}.vtu"
+        displacement, name = positions[frame] - start, f"{frame:04}.vtu"
         values = {
             "displacement": displacement,
             "speed": speed(positions, run.time, frame),
             "energy_density": energy_density(plan, displacement),
         }
         values = {key: mass_points(array, mask) for key, array in values.items()}
-        mesh = refine_surface(positions[frame], EXPORT_REFINE, mask)
+        mesh = refine_surface(positions[frame], EXPORT_REFINE, rest)
         write_new_file(folder / name, _document(_grid(mesh, values)))
         SubElement(files, "DataSet", timestep=repr(seconds), part="0", file=name)
     if picture is not None:

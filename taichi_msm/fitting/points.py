@@ -126,7 +126,7 @@ class PointObservation(Observation):
 
     def on_sheet(self, scene: Scene) -> Self:
         """Return the observation without points that fall on no sheet; raise a SceneError if none remains."""
-        if (mask := rest_of(scene.sheet).mask) is None or (covered := mask.covers(self.coordinates)).all():
+        if (covered := rest_of(scene.sheet).covers(self.coordinates)).all():
             return self
         if not self.is_observed[covered].any():
             fault = "all observed points fall on no sheet"

@@ -9,7 +9,9 @@ import numpy as np
 
 from taichi_msm.errors import Problem
 from taichi_msm.images import PictureError
+from taichi_msm.model.geometry import Rest
 from taichi_msm.model.mask import Mask
+from taichi_msm.model.rest import rest_of
 from taichi_msm.scene.scene import Scene
 from taichi_msm.scene.tools import Probe
 
@@ -25,7 +27,14 @@ def mask_problems(scene: Scene) -> Iterator[Problem]:
     except PictureError as error:
         yield Problem(KEY, str(error))
         return
-    mask = Mask.at_cells(is_sheet, scene.sheet.points)
+    if scene.calibrated_size is None:
+        mask = Mask.at_cells(is_sheet, scene.sheet.points)
+    else:
+        # Cells of a picture by a camera follow from the surface, whose faults are reported separately.
+        try:
+            mask = rest_of(scene.sheet).mask or Mask(np.empty((0, 0), bool))
+        except PictureError:
+            return
     if not mask.cells.any():
         colour, remedy = ("black", "remove invert") if scene.sheet.mask.invert else ("white", "set invert: true")
         yield Problem(KEY, f"no cell is sheet, as none has a {colour} pixel at its middle; {remedy}, or draw the sheet")
@@ -34,19 +43,19 @@ def mask_problems(scene: Scene) -> Iterator[Problem]:
         text = f"two parts meet only in the point at row {row}, column {column}; join them by a cell, or part them"
         yield Problem(KEY, text)
     else:
-        yield from place_problems(scene, mask)
+        yield from place_problems(scene, rest_of(scene.sheet))
 
 
-def place_problems(scene: Scene, mask: Mask) -> Iterator[Problem]:
+def place_problems(scene: Scene, rest: Rest) -> Iterator[Problem]:
     """Yield a problem for each force-controlled tool that is on no sheet at any time."""
     for index, probe in enumerate(scene.probes):
-        if not probe.moved and (place := _place_without_sheet(probe, mask, scene.time.duration)):
+        if not probe.moved and (place := _place_without_sheet(probe, rest, scene.time.duration)):
             moves = isinstance(probe.at[0], tuple)
-            remedy = "two keyframes at one time jump over a hole" if moves else "move the tool onto the sheet"
+            remedy = "move the tool onto the sheet" + (", over holes by two keyframes at one time" if moves else "")
             yield Problem(("probes", index, "at"), f"{place} is on no sheet, see sheet.mask; {remedy}")
 
 
-def _place_without_sheet(probe: Probe, mask: Mask, duration: float) -> str:
+def _place_without_sheet(probe: Probe, rest: Rest, duration: float) -> str:
     """Describe the first place and time at which a force-controlled tool is on no sheet; empty if there is none."""
     keys = np.array(probe.at if isinstance(probe.at[0], tuple) else ((0.0, *probe.at),), dtype=float)
     # The tool stays where its last keyframe is.
@@ -54,7 +63,7 @@ def _place_without_sheet(probe: Probe, mask: Mask, duration: float) -> str:
     for (begin, *first), (end, *last) in pairwise(keys.tolist()):
         start, offset = np.array(first), np.array(last) - first
         share = min(1.0, (duration - begin) / (end - begin)) if end > begin else -1.0
-        if share >= 0 and (gap := mask.first_gap(start, start + share * offset)) is not None:
+        if share >= 0 and (gap := rest.first_gap(start, start + share * offset)) is not None:
             across, down = start + gap * share * offset
             time = f" at {begin + gap * share * (end - begin):.3g} s" if len(keys) > 2 else ""
             return f"[{across:.3g}, {down:.3g}]{time}"

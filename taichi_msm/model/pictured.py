@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
+from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,13 +16,17 @@ from numpy.typing import NDArray
 from taichi_msm.arithmetic import Array
 from taichi_msm.cameras.view import View
 from taichi_msm.model.geometry import CurvedRest, Origin
-from taichi_msm.model.mask import Mask
+from taichi_msm.model.mask import EDGE_TOLERANCE, Mask
 
 # Cells near a place that are tried before all others.
 NEAR_CELLS = 32
 
 # Largest distance of s and t from 0 to 1 in the cell of a place.
 TOLERANCE = 1e-9
+
+# Places of the picture this far from an edge of the sheet are on it, as the sheet's sides are straight, those of a
+# picture by a lens are not [sides of a cell].
+BORDER_TOLERANCE = 0.05
 
 # Number of times that the outermost cell of a place beyond the picture is chosen.
 CONTINUATIONS = 4
@@ -90,6 +95,20 @@ class PicturedRest(CurvedRest):
 
     def sheet_places(self, mesh: Array) -> Array:
         return self.picture.fractions(self._interpolate(self._projected, mesh))
+
+    def covers(self, fractions: Array, tolerance: float = EDGE_TOLERANCE) -> NDArray[np.bool_]:
+        mesh = self.mesh_places(fractions)
+        counts = np.array(self.position.shape[1::-1]) - 1
+        covered = (np.abs(mesh - mesh.clip(0, 1)) * counts <= BORDER_TOLERANCE).all(axis=1)
+        return covered if self.mask is None else covered & self.mask.covers(mesh.clip(0, 1), tolerance)
+
+    def first_gap(self, start: Array, end: Array) -> float | None:
+        if self.mask is None:
+            return None
+        count = 2 * max(self.position.shape[:2])
+        places = self.mesh_places(start + np.linspace(0, 1, count + 1)[:, None] * (end - start))
+        gaps = (self.mask.first_gap(*ends) for ends in pairwise(places))
+        return next(((n + gap) / count for n, gap in enumerate(gaps) if gap is not None), None)
 
     def mesh_places(self, fractions: Array) -> Array:
         key = np.ascontiguousarray(fractions, float).tobytes()

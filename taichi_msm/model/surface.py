@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from taichi_msm.arithmetic import Array
+from taichi_msm.model.geometry import Rest
 from taichi_msm.model.mask import Mask
 from taichi_msm.model.rest import rest_of
 from taichi_msm.model.tool_force import control_point
@@ -46,7 +47,7 @@ def surface_point(position: NDArray[np.floating], refine: int, sheet: Sheet, at:
 def surface_positions(position: NDArray[np.floating], refine: int, coordinates: NDArray[np.floating]) -> Array:
     """Return the positions of material points on the refined surface [m], shape (n, 3).
 
-    Their coordinates, shape (n, 2), are fractions of the sheet's width from its left and of its height from its top.
+    Their coordinates, shape (n, 2), are the fractions (u, v) of columns and rows.
     """
     return _interpolate(position, refine, coordinates.astype(np.float64))[0]
 
@@ -54,10 +55,12 @@ def surface_positions(position: NDArray[np.floating], refine: int, coordinates: 
 def surface_weights(coordinates: Array, sheet: Sheet, refine: int) -> tuple[NDArray[np.intp], Array]:
     """Return the four mass points around each point of `surface_positions`, and their weights, shape (n, 4) each.
 
-    Mass points are numbered row by row. A point on no sheet, as of a coarser mesh, continues the nearest cell.
+    Coordinates are fractions across and down, shape (n, 2); mass points are numbered row by row. A point on no sheet,
+    as of a coarser mesh, continues the nearest cell.
     """
     cols = sheet.points[1]
-    i, j, s, t, twist = _cell_coordinates(coordinates, sheet.points, refine, rest_of(sheet).mask)
+    rest = rest_of(sheet)
+    i, j, s, t, twist = _cell_coordinates(rest.mesh_places(coordinates).clip(0, 1), sheet.points, refine, rest.mask)
     first = i * cols + j
     corners = np.stack([first, first + 1, first + cols, first + cols + 1], axis=1)
     return corners, np.stack([1 - s - t + twist, s - twist, t - twist, twist], axis=1)
@@ -109,17 +112,17 @@ class Solid(NamedTuple):
     shape: Shape
 
 
-def refine_surface(position: NDArray[np.floating], refine: int, mask: Mask | None = None) -> Surface:
+def refine_surface(position: NDArray[np.floating], refine: int, rest: Rest | None = None) -> Surface:
     """Return the triangles of the sheet after bilinear refinement (section 2 of the paper).
 
-    Every small quad is divided by the diagonal from top left to bottom right. `mask` has the cells that are sheet, by
-    default all.
+    Every small quad is divided by the diagonal from top left to bottom right. `rest` has the cells that are sheet, by
+    default all, and the places of the texture, by default those of columns and rows.
     """
     vertices = _insert(_insert(position, refine, 0), refine, 1)
     rows, cols = vertices.shape[:2]
     quads, points = np.ones((rows - 1, cols - 1), bool), np.ones((rows, cols), bool)
-    if mask is not None:
-        quads = mask.cells.repeat(refine + 1, axis=0).repeat(refine + 1, axis=1)
+    if rest is not None and rest.mask is not None:
+        quads = rest.mask.cells.repeat(refine + 1, axis=0).repeat(refine + 1, axis=1)
         points = Mask(quads).points
     corner = np.cumsum(points, dtype=np.int32).reshape(rows, cols) - 1
     upper_left, upper_right = corner[:-1, :-1], corner[:-1, 1:]
@@ -127,11 +130,10 @@ def refine_surface(position: NDArray[np.floating], refine: int, mask: Mask | Non
     lower = np.stack([upper_left, lower_left, lower_right], axis=-1)
     upper = np.stack([upper_left, lower_right, upper_right], axis=-1)
     across, down = np.meshgrid(np.linspace(0, 1, cols), np.linspace(0, 1, rows))
-    return Surface(
-        vertices[points],
-        np.stack([lower, upper], axis=2)[quads].reshape(-1, 3),
-        np.stack([across, down], axis=-1)[points],
-    )
+    mesh = np.stack([across, down], axis=-1)[points]
+    # A place that the camera of a picture does not see is at the picture's corner.
+    places = mesh if rest is None else np.nan_to_num(rest.sheet_places(mesh))
+    return Surface(vertices[points], np.stack([lower, upper], axis=2)[quads].reshape(-1, 3), places)
 
 
 def place_instruments(scene: Scene, position: NDArray[np.floating], time: float) -> list[Solid]:

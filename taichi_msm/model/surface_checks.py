@@ -68,7 +68,7 @@ def describe_fold(angles: Array) -> str:
 
 
 def _anisotropy(rest: CurvedRest, surface: RestSurface) -> str:
-    errors, area = rest.isotropy_errors[rest.present], rest.cells.area[rest.present]
+    errors, area = rest.isotropy_errors[rest.present], rest.present_cells.area
     share = float(area[errors > MAX_ISOTROPY_ERROR].sum() / area.sum())
     if share <= MAX_COARSE_SHARE:
         return ""
@@ -101,7 +101,7 @@ def isotropy_remedy(rest: CurvedRest, surface: RestSurface) -> str:
     """Return the numbers of points with nearly square cells, or the advice for sheared and uneven cells."""
     square, r = square_points(rest), aspect(rest)
     # Rhombi of 60 to 120 degrees are isotropic.
-    is_oblique = np.median(np.abs(rest.cells.cosine[rest.present])) > 0.5
+    is_oblique = np.median(np.abs(rest.present_cells.cosine)) > 0.5
     if max(r, 1 / r) >= MAX_ASPECT and not is_oblique and max(square) <= MAX_POINTS:
         return f"try sheet.points: {list(square)}, with nearly square cells"
     if surface.has_own_size and not surface.is_even:

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from taichi_msm.arithmetic import Array
 from taichi_msm.cameras.extrinsics import (
     OPENCV_SIGNS,
+    Extrinsics,
     extrinsics,
     interpolate_keyframes,
     look_at_axes,
@@ -22,6 +23,7 @@ from taichi_msm.cameras.lens import IDENTITY_LENS
 from taichi_msm.cameras.view import View, companion_view, pinhole_view
 from taichi_msm.errors import Key, Problem, SceneError
 from taichi_msm.lenses.model import MAX_RADIUS
+from taichi_msm.model.pictured import PicturedRest
 from taichi_msm.model.rest import rest_of
 from taichi_msm.model.surface import Solid
 from taichi_msm.scene.camera import Camera
@@ -106,6 +108,16 @@ def _view_of(scene: Scene, time: float, name: str) -> View:
         matrix[:, 3] -= matrix[:, :3] @ shift
         result = result._replace(matrix=matrix, eye=result.eye + shift)
     return result
+
+
+def picture_view(scene: Scene, texture_size: tuple[int, int]) -> View:
+    """Return the view of the camera of a picture on the sheet, for pixels that are texels; its light is at it."""
+    rest, surface = rest_of(scene.sheet), scene.sheet.surface
+    assert isinstance(rest, PicturedRest)
+    assert surface is not None
+    assert surface.frame is not None
+    distance = _distance(surface.frame.cameras[-1], scene)
+    return rest.picture.view.cropped(rest.picture.region, texture_size)._replace(near=_near(scene), distance=distance)
 
 
 def is_moving(scene: Scene, name: str = "") -> bool:
@@ -257,7 +269,7 @@ def pinhole(scene: Scene, time: float = 0.0) -> Camera:
     """
     camera = scene.render.main_camera
     if isinstance(camera, Camera):
-        return frozen_camera(camera, time)
+        return frozen_camera(camera, scene, time)
     if camera != "top":
         return PRESET_CAMERAS[camera](scene)
     distance = scene.render.size[1] / 2 / _top_scale(scene) / math.tan(math.radians(OBLIQUE_FOV) / 2)
@@ -266,11 +278,11 @@ def pinhole(scene: Scene, time: float = 0.0) -> Camera:
     return Camera(eye=(x, y, upper[2] + distance), target=(x, y, float(_middle(scene)[2])), fov=OBLIQUE_FOV)
 
 
-def frozen_camera(camera: Camera, time: float) -> Camera:
+def frozen_camera(camera: Camera, scene: Scene, time: float) -> Camera:
     """Return a camera at a time [s] as a static camera with eye, target and up."""
     if camera.pose is None and not camera.moves:
         return camera
-    eye, axes, distance = extrinsics(camera, time)
+    eye, axes, distance = _placement(camera, scene, time)
     optical_keys = camera.model_fields_set & {"fov", "intrinsics", "distortion", "outside"}
     optics = {name: getattr(camera, name) for name in optical_keys}
     target = eye - distance * axes[2]
@@ -337,10 +349,15 @@ def _pinhole(camera: Camera, scene: Scene, time: float) -> View:
 
 def _distance(camera: Camera, scene: Scene) -> float:
     """Return the distance at the start from the eye to the target, of a pose to the middle of the sheet [m]."""
-    eye, _, distance = extrinsics(camera, 0.0)
+    return _placement(camera, scene, 0.0).distance
+
+
+def _placement(camera: Camera, scene: Scene, time: float) -> Extrinsics:
+    """Return the extrinsics; with a picture by a camera, the distance of a pose is that to the middle of the sheet."""
+    placement = extrinsics(camera, time)
     if camera.eye is None and scene.calibrated_size:
-        return math.dist(eye, _middle(scene))
-    return distance
+        return placement._replace(distance=math.dist(placement.eye, _middle(scene)))
+    return placement
 
 
 def _near(scene: Scene) -> float:

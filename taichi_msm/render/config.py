@@ -28,6 +28,7 @@ Names that the functions of kernel 2 share, in addition to the fields of `Drawin
     visible, inside       masks of the samples of a tile
     normal                list of three components, of any length
     colour                list of red, green and blue, 0 to 255
+    a, b                  point in the camera of a picture, to the right and down at depth 1, without lens distortion
     slope_x, slope_y      gradient of the grey level, to the right and down [1/texel]
     row, end_row          first row of pixels, and the row after the last one
 
@@ -39,7 +40,7 @@ from functools import cache
 from typing import Any, NamedTuple
 
 from taichi_msm.render import uniforms as uni
-from taichi_msm.render.labels import LABELS
+from taichi_msm.render.labels import WRITTEN, values_per_pixel
 from taichi_msm.system.runtime import ti
 
 # Maximum number of samples in a row of a tile.
@@ -72,6 +73,8 @@ class DrawingConfig(NamedTuple):
     labels: frozenset[str]  # names of the labels that are written; they require one sample per pixel
     lens: str  # name of the lens model; empty without lens distortion
     lanes: int  # samples in a tile
+    picture_lens: str | None = None  # lens model of the camera of a picture by a camera; None for another picture
+    writes_light: bool = False  # whether the light is written, in place of colours and labels
 
     @property
     def tile_width(self) -> int:
@@ -102,6 +105,26 @@ class DrawingConfig(NamedTuple):
     def has_distortion(self) -> bool:
         """Whether the camera has lens distortion."""
         return self.lens != ""
+
+    @property
+    def is_pictured(self) -> bool:
+        """Whether the texture is a picture by a camera."""
+        return self.picture_lens is not None
+
+    @property
+    def picture_stride(self) -> int:
+        """Numbers per mass point at rest in the camera of a picture: to the right, down and forward [m]."""
+        return 3 * self.is_pictured
+
+    @property
+    def is_relit(self) -> bool:
+        """Whether colours are relative to the light in which the picture was taken."""
+        return self.is_pictured and (self.headlit or self.tissue) and not self.writes_light
+
+    @property
+    def values_per_pixel(self) -> int:
+        """Floating-point values that are written per pixel."""
+        return 1 if self.writes_light else values_per_pixel(self.labels)
 
     @property
     def map_planes(self) -> int:
@@ -150,7 +173,7 @@ class DrawingConfig(NamedTuple):
 def _planes(config: DrawingConfig) -> Any:
     """Return the index of each plane that a configuration needs, by name."""
     needed = {
-        **{plane: name in config.labels for name, label in LABELS.items() for plane in label.planes},
+        **{plane: name in config.labels for name, label in WRITTEN.items() for plane in label.planes},
         **dict.fromkeys(("depth", "texel_x", "texel_y"), True),  # of the visible surface; texture coordinates [texels]
         "light": config.headlit,  # reflected share of the headlight
         "wire": config.wireframe,  # opacity of the mesh's lines
@@ -158,6 +181,8 @@ def _planes(config: DrawingConfig) -> Any:
         **dict.fromkeys(("normal_x", "normal_y", "normal_z"), config.tissue or config.metal),  # in the camera's frame
         **dict.fromkeys(("cell", "triangle"), config.unordered),  # indices of the visible cell and triangle
         "footprint": config.tissue,  # squared size of a sample on the texture
+        # Of a picture by a camera: `texel_x`, `texel_y` at the next samples to the right and below.
+        **dict.fromkeys(("right_x", "right_y", "below_x", "below_y"), config.tissue and config.is_pictured),
         **dict.fromkeys(("red", "green", "blue"), config.picture and config.supersample > 1),  # before averaging
     }
     names = [name for name, is_needed in needed.items() if is_needed]

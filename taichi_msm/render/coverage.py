@@ -56,6 +56,7 @@ class Cell(NamedTuple):
     texels_across: Any  # width and height of the cell [texels]
     texels_down: Any
     normal: Any  # entry of the normal at the upper left mass point
+    source: Any  # entry of the upper left mass point in the camera of a picture
 
 
 @ti.func
@@ -288,12 +289,35 @@ def _cell_at(i, j, normal_entry, patch: ti.template(), band: ti.template()):
     texels_across, texels_down = ti.cast(texture_width, ti.f32) / cols, ti.cast(texture_height, ti.f32) / rows
     row, column = ti.cast(i, ti.f32), ti.cast(j, ti.f32)
     cell_rows, cell_cols = ti.cast(rows, ti.f32), ti.cast(cols, ti.f32)
+    source = geometry.picture_entry(i * band.cols + j, band)
     return ti.static(
         Cell(
             patch, row, column, cell_rows, cell_cols, first_x, first_y, fraction_x, fraction_y,
-            texels_across, texels_down, normal_entry,
+            texels_across, texels_down, normal_entry, source,
         )
     )  # fmt: skip
+
+
+@ti.func
+def _source_at(s, t, quad_column, quad_row, below, cell: ti.template(), band: ti.template()):
+    """Return a and b of points on a triangle, interpolated from the cell's corners as positions are."""
+    quad_side = 1.0 / band.subdivisions
+    across, along = (quad_column + s) * quad_side, (quad_row + t) * quad_side
+    # In the sub-quad, the product s t is replaced by a function that is linear on each side of the diagonal.
+    twist = quad_column * quad_row + s * quad_row + quad_column * t + ti.select(below, s, t)
+    twist = twist * (quad_side * quad_side)
+    corners = ti.static(geometry.corner_entries(cell.source, band.cols, band.config.picture_stride))
+    p, right, down, opposite = [triple(band.nodes, entry) for entry in corners]
+    h = [
+        p[n]
+        + (right[n] - p[n]) * across
+        + (down[n] - p[n]) * along
+        + (opposite[n] - right[n] - (down[n] - p[n])) * twist
+        for n in ti.static(range(3))
+    ]
+    # Behind the camera the texels are at the picture's edge.
+    depth = ti.max(h[2], 1e-9)
+    return h[0] / depth, h[1] / depth
 
 
 @ti.func
@@ -340,6 +364,10 @@ def store_point(position: ti.template(), i, j, band: ti.template()):
             band.nodes[normal_entry + n] = normal[n]
             if ti.static(config.tissue):
                 band.nodes[normal_entry + n] = dot(triple(band.uniforms, uni.AXES + 3 * n), normal)
+    if ti.static(config.is_pictured):
+        source_entry = geometry.picture_entry(i * band.cols + j, band)
+        for n in ti.static(range(config.picture_stride)):
+            band.nodes[source_entry + n] = position[i, j, 3 + n]
 
 
 @ti.func
@@ -395,6 +423,18 @@ def _footprint(entry, x, y, s, t, texels_x, texels_y, triangle: ti.template(), b
 
 
 @ti.func
+def _next_samples(entry, x, y, triangle: ti.template(), band: ti.template()):
+    """Return s and t on a triangle of the next samples on the right, then of those below."""
+    right_x, right_y, below_x, below_y = x + 1.0, y, x, y + 1.0
+    if ti.static(band.config.map_has_steps):
+        map_step = map_steps(entry, band)
+        right_x, right_y, below_x, below_y = x + map_step[0], y + map_step[1], x + map_step[2], y + map_step[3]
+    s_right, t_right = geometry.on_triangle(right_x, right_y, triangle)
+    s_below, t_below = geometry.on_triangle(below_x, below_y, triangle)
+    return s_right, t_right, s_below, t_below
+
+
+@ti.func
 def _distance_to_line(coordinate, right_coordinate, lower_coordinate):
     """Return the distance of samples from the nearest mesh line of one direction [samples].
 
@@ -417,11 +457,19 @@ def _store_surface(
     quad_side = 1.0 / band.subdivisions
     across = (quad_column + s) * quad_side
     along = (quad_row + t) * quad_side
-    store_visible(entry + plane.texel_x, visible, cell.fraction_x + across * cell.texels_across + cell.texel_x, samples)
-    store_visible(entry + plane.texel_y, visible, cell.fraction_y + along * cell.texels_down + cell.texel_y, samples)
-    if ti.static("coordinates" in config.labels):
+    texel_x = cell.fraction_x + across * cell.texels_across + cell.texel_x
+    texel_y = cell.fraction_y + along * cell.texels_down + cell.texel_y
+    if ti.static(config.is_pictured):
+        # Until `shading.locate_texels`.
+        texel_x, texel_y = _source_at(s, t, quad_column, quad_row, triangle.below, cell, band)
+    store_visible(entry + plane.texel_x, visible, texel_x, samples)
+    store_visible(entry + plane.texel_y, visible, texel_y, samples)
+    if ti.static("coordinates" in config.labels and not config.is_pictured):
         store_visible(entry + plane.across, visible, (cell.j + across) / cell.cols, samples)
         store_visible(entry + plane.down, visible, (cell.i + along) / cell.rows, samples)
+    if ti.static("mesh" in config.labels):
+        store_visible(entry + plane.mesh_across, visible, (cell.j + across) / cell.cols, samples)
+        store_visible(entry + plane.mesh_down, visible, (cell.i + along) / cell.rows, samples)
     if ti.static("normals" in config.labels):
         store_visible_unit(entry + plane.facet_x, visible, geometry.facet(x, y, triangle, band.uniforms), samples)
     if ti.static(config.headlit):
@@ -435,13 +483,16 @@ def _store_surface(
         for n in ti.static(range(3)):
             store_visible(entry + (plane.normal_x + n), visible, normal[n] * side, samples)
         store_visible(entry + plane.footprint, visible, size, samples)
+    if ti.static(config.tissue and config.is_pictured):
+        s_right, t_right, s_below, t_below = _next_samples(entry, x, y, triangle, band)
+        texel_x, texel_y = _source_at(s_right, t_right, quad_column, quad_row, triangle.below, cell, band)
+        store_visible(entry + plane.right_x, visible, texel_x, samples)
+        store_visible(entry + plane.right_y, visible, texel_y, samples)
+        texel_x, texel_y = _source_at(s_below, t_below, quad_column, quad_row, triangle.below, cell, band)
+        store_visible(entry + plane.below_x, visible, texel_x, samples)
+        store_visible(entry + plane.below_y, visible, texel_y, samples)
     if ti.static(config.wireframe):
-        right_x, right_y, below_x, below_y = x + 1.0, y, x, y + 1.0
-        if ti.static(config.map_has_steps):
-            map_step = map_steps(entry, band)
-            right_x, right_y, below_x, below_y = x + map_step[0], y + map_step[1], x + map_step[2], y + map_step[3]
-        s_right, t_right = geometry.on_triangle(right_x, right_y, triangle)
-        s_below, t_below = geometry.on_triangle(below_x, below_y, triangle)
+        s_right, t_right, s_below, t_below = _next_samples(entry, x, y, triangle, band)
         distance = ti.min(
             _distance_to_line(across, (quad_column + s_right) * quad_side, (quad_column + s_below) * quad_side),
             _distance_to_line(along, (quad_row + t_right) * quad_side, (quad_row + t_below) * quad_side),

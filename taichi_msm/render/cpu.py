@@ -23,7 +23,6 @@ from taichi_msm.render.config import (
     read_arguments,
 )
 from taichi_msm.render.coverage import cover_cell, cover_instruments, store_point
-from taichi_msm.render.labels import values_per_pixel
 from taichi_msm.render.shading import resolve
 from taichi_msm.render.undistortion import INVALID_COORDINATE
 from taichi_msm.system import runtime
@@ -42,7 +41,7 @@ class Bands:
         self._workers = min(-(-height // config.band_rows), runtime.current_device().threads)
         self._memory = memory = runtime.Memory()
         # Projected mass points; then, for each row of them, the first and last row of the undistorted picture.
-        self._nodes = memory.array("f32", 0, rows * (cols * geometry.POINT_STRIDE + 2))
+        self._nodes = memory.array("f32", 0, rows * (cols * (geometry.POINT_STRIDE + config.picture_stride) + 2))
         tiles_of_band = config.band_lines * config.tiles_across(width)
         # The undistortion map, in which each band ends with its bounds; then the G-buffer of a band per worker.
         map_vectors = -(-height // config.band_rows) * (tiles_of_band * config.map_planes + config.has_distortion)
@@ -62,8 +61,8 @@ class Bands:
         picture = np.empty((height, stride, 3) if config.picture else (1, 4, 3), np.uint8)
         # Without labels the argument is unused: any Taichi array, which is passed in half the time of a NumPy array.
         labels: Any = self._nodes
-        if config.labels:
-            labels = np.zeros(values_per_pixel(config.labels) * width * height, np.float32)
+        if config.values_per_pixel:
+            labels = np.zeros(config.values_per_pixel * width * height, np.float32)
         sizes[[uni.ROWS_TAKEN, uni.ROWS_PROJECTED, uni.BANDS_TAKEN]] = 0
         with runtime.compilation_options(optimised=False):
             self._draw(
@@ -110,7 +109,7 @@ def _project_row(position: ti.template(), i, band: ti.template()):
             last_row = ti.max(last_row, nodes[entry + geometry.SCREEN + 1])
         else:
             first_row, last_row = -INFINITY, INFINITY
-    row_entry = band.rows * cols * geometry.POINT_STRIDE + 2 * i
+    row_entry = band.rows * cols * (geometry.POINT_STRIDE + band.config.picture_stride) + 2 * i
     nodes[row_entry] = first_row
     nodes[row_entry + 1] = last_row
 
@@ -148,7 +147,7 @@ def _cover_band(band: ti.template()):
         top, bottom = box[2] - 1.0, box[3] + 1.0
     subdivisions = ti.cast(band.subdivisions, ti.i32)
     for i in range(band.rows - 1):
-        row_entry = band.rows * cols * geometry.POINT_STRIDE + 2 * i
+        row_entry = band.rows * cols * (geometry.POINT_STRIDE + band.config.picture_stride) + 2 * i
         first_row = ti.min(nodes[row_entry], nodes[row_entry + 2])
         last_row = ti.max(nodes[row_entry + 1], nodes[row_entry + 3])
         if first_row < bottom and last_row > top:

@@ -16,8 +16,8 @@ from taichi_msm.render import uniforms as uni
 from taichi_msm.render.config import INFINITY, cross
 from taichi_msm.system.runtime import ti
 
-# Layout of `nodes`: blocks of projections, normals and distorted positions, each with its stride per mass point. In f64
-# (tracking.py) only the first block exists.
+# Layout of `nodes`: blocks of projections, normals, distorted positions, and points of a picture by a camera, each with
+# its stride per mass point. In f64 (tracking.py) only the first block exists.
 NODE_STRIDE = 6  # X, Y, w, depth; from SCREEN on x and y in the picture [samples]
 SCREEN = 4
 NORMAL_STRIDE = 3
@@ -103,6 +103,12 @@ def point_entries(point, band: ti.template()):
         points * NODE_STRIDE + point * NORMAL_STRIDE,
         points * (NODE_STRIDE + NORMAL_STRIDE) + point * DISTORTED_STRIDE,
     )
+
+
+@ti.func
+def picture_entry(point, band: ti.template()):
+    """Return the first entry of a mass point in the picture's camera in `nodes`."""
+    return band.rows * band.cols * POINT_STRIDE + point * band.config.picture_stride
 
 
 @ti.func

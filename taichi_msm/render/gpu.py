@@ -26,7 +26,6 @@ from taichi_msm.render.config import (
     read_arguments,
 )
 from taichi_msm.render.coverage import cover_cell, cover_instruments, store_point
-from taichi_msm.render.labels import values_per_pixel
 from taichi_msm.render.shading import resolve
 from taichi_msm.system.launches import VULKAN_THREADS, Launches, end_thread
 from taichi_msm.system.runtime import compilation_options, ti, write_vectors
@@ -54,7 +53,7 @@ class Threads:
         # Rows of pixels in a strip.
         self._strip_rows = min(max(1, VULKAN_THREADS // (samples_across * config.supersample)), height)
         self._texels = launches.upload(texels)
-        self._nodes = launches.array(np.float32, rows * cols * geometry.POINT_STRIDE)
+        self._nodes = launches.array(np.float32, rows * cols * (geometry.POINT_STRIDE + config.picture_stride))
         self._pieces = launches.array(np.int32, self._cells)
         strip = self._strip_rows * config.supersample * samples_across * config.planes
         # The undistortion map, empty without lens distortion; then the strip.
@@ -62,7 +61,7 @@ class Threads:
             config.float_vector, height * config.supersample * samples_across * config.map_planes + strip
         )
         self._colours = launches.array(np.uint8, 3 * width * height if config.picture else 1)
-        self._labels = launches.array(np.float32, max(values_per_pixel(config.labels) * width * height, 1))
+        self._labels = launches.array(np.float32, max(config.values_per_pixel * width * height, 1))
 
     def set_undistortion_map(self, table: NDArray[np.float32]) -> None:
         """Set the undistortion map of the following pictures, as returned by `undistortion_map`."""

@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from taichi_msm.model.mask import Mask
+from taichi_msm.model.geometry import Rest
 
 # Unknown flow in the Middlebury format.
 NO_FLOW = 1e10
@@ -35,6 +35,15 @@ class Labels(NamedTuple):
     normals: NDArray[np.float32] = np.empty((0, 0, 3), np.float32)
 
 
+class PicturedLabels(Labels):
+    """Labels of a sheet with a picture by a camera, whose fractions are the coordinates.
+
+    `mesh` are the fractions (u, v) of columns and rows, shape (height, width, 2), NaN where the sheet is not visible.
+    """
+
+    mesh: NDArray[np.float32]
+
+
 class Label(NamedTuple):
     """Layout of a label in the output of kernel 2: one or several values per pixel, row by row."""
 
@@ -53,6 +62,9 @@ LABELS = {
     "normals": Label(("facet_x", "facet_y", "facet_z"), math.nan, sheet_only=False, dtype=np.float32, is_optional=True),
 }
 
+# All labels that kernel 2 writes: with a picture by a camera also `PicturedLabels.mesh`.
+WRITTEN = {**LABELS, "mesh": Label(("mesh_across", "mesh_down"), math.nan, sheet_only=True, dtype=np.float32)}
+
 
 def requested_labels(outputs: Collection[str]) -> frozenset[str]:
     """Return the names of the labels to write: the optional ones only if they are among the outputs."""
@@ -62,7 +74,7 @@ def requested_labels(outputs: Collection[str]) -> frozenset[str]:
 def _label_offsets(names: Collection[str]) -> Iterator[tuple[str, Label, int]]:
     """Yield the name, the label and its offset [values per pixel] of the labels of these names."""
     offset = 0
-    for name, label in LABELS.items():
+    for name, label in WRITTEN.items():
         if name in names:
             yield name, label, offset
             offset += len(label.planes)
@@ -70,7 +82,7 @@ def _label_offsets(names: Collection[str]) -> Iterator[tuple[str, Label, int]]:
 
 def values_per_pixel(names: Collection[str]) -> int:
     """Return the number of values per pixel of labels."""
-    return sum(len(LABELS[name].planes) for name in names)
+    return sum(len(WRITTEN[name].planes) for name in names)
 
 
 class Channel(NamedTuple):
@@ -100,8 +112,15 @@ def labels_of(numbers: NDArray[np.float32], size: tuple[int, int], names: Collec
         values = numbers.reshape(-1, width * height)[offset : offset + count]
         arrays[name] = values.reshape((height, width, count)[: 2 + (count > 1)]).astype(label.dtype, copy=False)
     # Rounding may move coordinates beyond the sheet's edge.
-    arrays["coordinates"] = arrays["coordinates"].clip(0, 1)
-    return Labels(**arrays)
+    for name in ("coordinates", "mesh"):
+        if name in arrays:
+            arrays[name] = arrays[name].clip(0, 1)
+    mesh = arrays.pop("mesh", None)
+    if mesh is None:
+        return Labels(**arrays)
+    labels = PicturedLabels(**arrays)
+    labels.mesh = mesh
+    return labels
 
 
 class Flow(NamedTuple):
@@ -154,12 +173,12 @@ class FrameOutputs(NamedTuple):
     tracks: Sight | None = None
 
 
-def track_grid(count: int, mask: Mask | None = None) -> NDArray[np.float32]:
+def track_grid(count: int, rest: Rest | None = None) -> NDArray[np.float32]:
     """Return the coordinates of the centres of count^2 equal parts of the rectangle, row by row, shape (n, 2).
 
-    Of a masked sheet, those on it.
+    With a sheet, those on it.
     """
     centres = (np.arange(count) + 0.5) / count
     down, across = np.meshgrid(centres, centres, indexing="ij")
     coordinates = np.stack([across, down], axis=-1).reshape(-1, 2)
-    return (coordinates if mask is None else coordinates[mask.covers(coordinates)]).astype(np.float32)
+    return (coordinates if rest is None else coordinates[rest.covers(coordinates)]).astype(np.float32)

@@ -45,6 +45,22 @@ def distorted_point(x, y, uniforms: ti.template(), lens: ti.template()):
 
 
 @ti.func
+def texel_of(a, b, uniforms: ti.template(), lens: ti.template()):
+    """Return the texel of points in the camera of a picture, which has this lens model, one per lane."""
+    distorted_a, distorted_b = a, b
+    if ti.static(lens != ""):
+        # A point beyond the limit of the lens is first moved to the limit.
+        factor = ti.min(uniforms[uni.PICTURE_LENS_RADIUS] / ti.sqrt(ti.max(a * a + b * b, 1e-30)), 1.0)
+        k = [uniforms[uni.PICTURE_LENS + n] for n in ti.static(range(len(MODELS[lens].coefficients)))]
+        distort = ti.static(compile_lens(lens))
+        distorted_a, distorted_b = distort(a * factor, b * factor, *k)
+    return (
+        uniforms[uni.TEXEL_X] + uniforms[uni.TEXEL_FOCAL_X] * distorted_a,
+        uniforms[uni.TEXEL_Y] + uniforms[uni.TEXEL_FOCAL_Y] * distorted_b,
+    )
+
+
+@ti.func
 def squared_length(x: ti.template(), y: ti.template()):
     """Return the squared length of the longest side of a triangle or a cell, whose vertices are in row order."""
     sides = ti.static(((0, 1), (1, 2), (2, 0)) if len(x) == 3 else ((0, 1), (1, 3), (3, 2), (2, 0)))

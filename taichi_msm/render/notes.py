@@ -15,6 +15,7 @@ from taichi_msm.render import texture
 from taichi_msm.render.camera import is_moving, view_at
 from taichi_msm.render.labels import track_grid
 from taichi_msm.scene.camera import Camera, Distortion
+from taichi_msm.scene.framing import MATTE
 from taichi_msm.scene.render import Light
 from taichi_msm.scene.scene import Scene
 from taichi_msm.scene.sheet import Sheet
@@ -29,12 +30,12 @@ def drawing_warnings(scene: Scene) -> Iterator[str]:
         yield from _stretched_picture(scene)
         if texture.is_see_through(scene):
             yield f"parts of the picture are transparent, and show render.background: {list(scene.render.background)}"
-        if scene.render.light != Light() and scene.render.shading != "tissue":
+        if scene.render.light not in (Light(), Light(**MATTE)) and scene.render.shading != "tissue":
             yield f"render.light has no effect with shading: {scene.render.shading}; take render.shading: tissue"
     if scene.renders:
         yield from _invisible_sheet(scene)
     if scene.asks_for("tracks"):
-        count, tracks = scene.render.tracks**2, len(track_grid(scene.render.tracks, rest_of(scene.sheet).mask))
+        count, tracks = scene.render.tracks**2, len(track_grid(scene.render.tracks, rest_of(scene.sheet)))
         if tracks < count:
             yield f"render.tracks: {count - tracks} of {count} tracks are left out, as they fall on no sheet"
     for index, probe in enumerate(scene.probes):

@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 from taichi_msm.arithmetic import Array
 from taichi_msm.cameras.view import View
 from taichi_msm.model.crossings import cells_on_line
+from taichi_msm.model.geometry import Rest
 from taichi_msm.model.mask import Mask
 from taichi_msm.model.rest import rest_of
 from taichi_msm.scene.sheet import Sheet
@@ -21,7 +22,7 @@ Pair = tuple[float, float]
 def pick(position: NDArray[np.floating], refine: int, view: View, pixel: Pair, mask: Mask | None = None) -> Pair | None:
     """Return the material point at the centre of a pixel, on the nearest triangle there; None without a surface.
 
-    It is in fractions of the sheet's width from its left and of its height from its top. `position` are the positions
+    It is in fractions (u, v) of columns and rows. `position` are the positions
     of the mass points [m], shape (rows, cols, 3); `mask` has the cells that are sheet, by default all.
 
     A point (X, Y, w, depth) projects to (x, y) if a = X - x w and b = Y - y w are 0. Both are linear, and need no
@@ -49,11 +50,19 @@ def pick_at_rest(sheet: Sheet, refine: int, view: View, pixel: Pair) -> Pair | N
     """
     rest = rest_of(sheet)
     if not rest.is_flat:
-        return pick(rest.position, refine, view, pixel)
+        return place_on_sheet(rest, pick(rest.position, refine, view, pixel))
     point = intersect_rest_plane(view, pixel)
     if point is None:
         return None
     across, down = rest.fractions(point.astype(np.float64)).tolist()
+    return across, down
+
+
+def place_on_sheet(rest: Rest, mesh: Pair | None) -> Pair | None:
+    """Return the place (across, down) at (u, v), if any."""
+    if mesh is None:
+        return None
+    across, down = rest.sheet_places(np.array([mesh]))[0].tolist()
     return across, down
 
 

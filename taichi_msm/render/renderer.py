@@ -68,7 +68,9 @@ class Renderer:
         # The complete scene is validated, so that errors name the keys of a scene.
         single_camera = {**dict(render), "camera": camera}
         single_camera.pop("cameras")
-        return view(self.scene.model_copy(update={"render": single_camera, "output": ()}), time)
+        # Another camera does not change the surface.
+        sheet = self.scene.sheet.with_kept_frame()
+        return view(self.scene.model_copy(update={"render": single_camera, "sheet": sheet, "output": ()}), time)
 
     def draw(self, shot: Shot, style: Render | None = None) -> NDArray[np.uint8]:
         """Draw a picture, shape (height, width, 3); `style` may differ from the scene in `shading` and `wireframe`."""
@@ -103,9 +105,9 @@ class Renderer:
         on_sheet = points.dtype.kind == "f" and not ((points < 0) | (points > 1)).any()
         if points.shape != (height, width, 2) or not on_sheet:
             raise ArgumentError(f"before: take the result of `labels` for a picture of {width} x {height} pixels")
-        from taichi_msm.render.tracking import compute_flow
+        from taichi_msm.render.tracking import compute_flow, mesh_of
 
-        return compute_flow(self.scene, points, shot)
+        return compute_flow(self.scene, mesh_of(self.scene, before), shot)
 
     def locate(self, coordinates: Array, shot: Shot) -> Sight:
         """Project material points, with coordinates on the sheet, shape (n, 2), and determine their occlusion.
@@ -137,7 +139,7 @@ class Renderer:
         if before is not None and scene.asks_for("flow"):
             observed = observed._replace(flow=self.flow(before, shot))
         if scene.asks_for("tracks"):
-            grid = track_grid(scene.render.tracks, rest_of(scene.sheet).mask)
+            grid = track_grid(scene.render.tracks, rest_of(scene.sheet))
             observed = observed._replace(tracks=self.locate(grid, shot))
         return observed
 
@@ -161,7 +163,8 @@ class Renderer:
         if key not in self._rasterizers:
             from taichi_msm.render.rasterizer import Rasterizer, drawing_config
 
-            scene = self.scene if style is None else self.scene.model_copy(update={"render": style})
+            scene, sheet = self.scene, self.scene.sheet.with_kept_frame()
+            scene = scene if style is None else scene.model_copy(update={"render": style, "sheet": sheet})
             texture = np.zeros((1, 1, 3), np.uint8)
             if picture:
                 texture = self._texture = load_texture(self.scene) if self._texture is None else self._texture

@@ -10,6 +10,9 @@ M = 2 (N L) N - L the direction of ideal reflection of the light:
     light    = ambient + (1 - ambient) diffuse / diffuse0
     colour   = texture light + 255 gloss (M V)^shininess d0 / d
 
+Of a picture by a camera, the light is divided by that of the same place at rest from that camera, in which the picture
+was taken: the `reference light`, a picture of floating-point numbers of the texture's size after its texels.
+
 d is the distance of P from the light, d0 that of the main camera's target, and diffuse0 the diffuse light at the
 target on a sheet that faces the camera. There the colours are those of the texture. Wrapped diffuse light approximates
 scattering in tissue: no side of a dent is black. An instrument shades the tissue near it: at r radii from its axis, it
@@ -27,8 +30,36 @@ from taichi_msm.render import uniforms as uni
 from taichi_msm.render.config import INFINITY, dot, sample_centres, triple, undistorted_centres
 from taichi_msm.render.geometry import line_of_sight, w_at
 from taichi_msm.render.labels import label_channels
+from taichi_msm.render.lens_kernels import texel_of
 from taichi_msm.system.array_cache import cached_arrays
 from taichi_msm.system.runtime import ti
+
+# Largest ratio of the light to the reference light.
+MAX_LIGHT_RATIO = 4.0
+
+
+@ti.func
+def locate_texels(entry, band: ti.template()):
+    """Replace the points of a tile in the camera of a picture by their texels, and compute footprints and labels."""
+    config, samples, uniforms = ti.static((band.config, band.samples, band.uniforms))
+    plane = ti.static(config.plane)
+    x, y = texel_of(samples[entry + plane.texel_x], samples[entry + plane.texel_y], uniforms, config.picture_lens)
+    samples[entry + plane.texel_x], samples[entry + plane.texel_y] = x, y
+    if ti.static("coordinates" in config.labels):
+        width, height = band.sizes[uni.LEVELS + 1], band.sizes[uni.LEVELS + 2]
+        samples[entry + plane.across] = (x + 0.5) / ti.cast(width, ti.f32)
+        samples[entry + plane.down] = (y + 0.5) / ti.cast(height, ti.f32)
+    if ti.static(config.tissue):
+        right_x, right_y = texel_of(
+            samples[entry + plane.right_x], samples[entry + plane.right_y], uniforms, config.picture_lens
+        )
+        below_x, below_y = texel_of(
+            samples[entry + plane.below_x], samples[entry + plane.below_y], uniforms, config.picture_lens
+        )
+        right_x, right_y, below_x, below_y = right_x - x, right_y - y, below_x - x, below_y - y
+        largest = ti.max(right_x * right_x + right_y * right_y, below_x * below_x + below_y * below_y)
+        square = largest * (1.0 / (uni.FULL_RESOLUTION_TEXELS * uni.FULL_RESOLUTION_TEXELS))
+        samples[entry + plane.footprint] = ti.min(square, 1e12)
 
 
 @ti.func
@@ -40,13 +71,21 @@ def _shade(entry, left, top, texels: ti.template(), band: ti.template()):
     is_covered = depth < INFINITY
     colour, slope_x, slope_y = _filter_texture(entry, is_covered, texels, band)
     if ti.static(config.headlit):
+        light = samples[entry + plane.light]
+        if ti.static(config.is_relit):
+            light = _relative_light(light, entry, is_covered, texels, band)
         for n in ti.static(range(3)):
-            colour[n] *= samples[entry + plane.light]
+            colour[n] *= light
+            if ti.static(config.is_relit):
+                colour[n] = ti.min(colour[n], 255.0)
     x, y = undistorted_centres(left, top, entry, band)
     normal = [samples[entry + (plane.normal_x + n)] for n in ti.static(range(3 * (config.tissue or config.metal)))]
     if ti.static(config.tissue):
         column, row = sample_centres(left, top, config)
-        share, gloss = _light_tissue(x, y, depth, normal, slope_x, slope_y, column, row, band)
+        share, gloss = _reflect(x, y, depth, normal, slope_x, slope_y, band)
+        if ti.static(config.is_relit):
+            share = _relative_light(ti.max(ti.min(share, 8.0), 0.0), entry, is_covered, texels, band)
+        share, gloss = _attenuate(share, gloss, x, y, depth, column, row, band)
         for n in ti.static(range(3)):
             colour[n] = ti.min(colour[n] * share + gloss, 255.0)
     if ti.static(config.wireframe):
@@ -62,6 +101,56 @@ def _shade(entry, left, top, texels: ti.template(), band: ti.template()):
     return [
         ti.select(is_covered, colour[n], config.float_vector(uniforms[uni.BACKGROUND + n])) for n in ti.static(range(3))
     ]
+
+
+@ti.func
+def _light(entry, left, top, texels: ti.template(), band: ti.template()):
+    """Return the factor of the texture's colours at a tile, without vignette and instruments; -1 without a surface."""
+    config, samples = ti.static((band.config, band.samples))
+    plane = ti.static(config.plane)
+    depth = samples[entry + plane.depth]
+    light = config.float_vector(1)
+    if ti.static(config.headlit):
+        light = samples[entry + plane.light]
+    else:
+        _colour, slope_x, slope_y = _filter_texture(entry, depth < INFINITY, texels, band)
+        x, y = undistorted_centres(left, top, entry, band)
+        normal = triple(samples, entry + plane.normal_x)
+        factor, _gloss = _reflect(x, y, depth, normal, slope_x, slope_y, band)
+        light = ti.max(ti.min(factor, 8.0), 0.0)
+    return ti.select(depth < INFINITY, light, -1.0)
+
+
+@ti.func
+def _relative_light(light, entry, is_covered, texels: ti.template(), band: ti.template()):
+    """Return the ratio of light at a tile to the reference light; 1 where both are 0."""
+    config, sizes, samples = ti.static((band.config, band.sizes, band.samples))
+    plane = ti.static(config.plane)
+    last = uni.LEVELS + uni.LEVEL_STRIDE * (sizes[uni.LEVEL_COUNT] - 1)
+    first = sizes[last] + sizes[last + 1] * sizes[last + 2]
+    width, height = sizes[uni.LEVELS + 1], sizes[uni.LEVELS + 2]
+    x = ti.select(is_covered, samples[entry + plane.texel_x], 0.0)
+    y = ti.select(is_covered, samples[entry + plane.texel_y], 0.0)
+    ul, ur, ll, lr, u, v = _texels_around(
+        config.integer_vector(first), config.integer_vector(width), config.integer_vector(height), x, y, config
+    )
+    corners = [
+        config.float_vector([texels[index[lane]] for lane in ti.static(range(config.lanes))])
+        for index in ti.static((ul, ur, ll, lr))
+    ]
+    reference = _bilinear(corners[0], corners[1], corners[2], corners[3], u, v)
+    ratio = ti.min(light / ti.max(reference, 1e-20), MAX_LIGHT_RATIO)
+    return ti.select((light <= 0.0) & (reference <= 0.0), 1.0, ratio)
+
+
+@ti.func
+def _write_light(light, left, row, end_row, lights: ti.template(), band: ti.template()):
+    """Write the light of the pixels of a tile."""
+    config = ti.static(band.config)
+    for line in ti.static(range(config.tile_height)):
+        for n in ti.static(range(config.tile_width)):
+            if row + line < end_row and left + n < band.width:
+                lights[(row + line) * band.width + left + n] = light[line * config.tile_width + n]
 
 
 @ti.func
@@ -140,9 +229,14 @@ def resolve(
         for tile in range(left * factor // tile_width, (right * factor + tile_width - 1) // tile_width):
             entry = band.first + (tile_row * band.tiles_across + tile) * config.planes
             column, top = tile * tile_width, tile_row * tile_height
+            if ti.static(config.is_pictured):
+                locate_texels(entry, band)
             if ti.static(len(config.labels) > 0):
                 _write_labels(entry, column, row + top, end_row, labels, band)
-            if ti.static(config.picture):
+            if ti.static(config.writes_light):
+                light = _light(entry, column, row + top, texels, band)
+                _write_light(light, column, row + top, end_row, labels, band)
+            if ti.static(config.picture and not config.writes_light):
                 colour = _shade(entry, column, row * factor + top, texels, band)
                 if ti.static(factor == 1):
                     _write_colours(colour, row + top, end_row, tile, colours, band)
@@ -219,11 +313,8 @@ def _apply_relief(normal: ti.template(), slope_x, slope_y, uniforms: ti.template
 
 
 @ti.func
-def _light_tissue(x, y, depth, normal: ti.template(), slope_x, slope_y, column, row, band: ti.template()):
-    """Return the factor of the texture's colours, and the gloss that is added to the product, in grey levels.
-
-    `column` and `row` are the distorted positions of the samples in the picture.
-    """
+def _reflect(x, y, depth, normal: ti.template(), slope_x, slope_y, band: ti.template()):
+    """Return the factor of the texture's colours, and the gloss that is added to the product, in grey levels."""
     config, uniforms = ti.static((band.config, band.uniforms))
     tilted = [normal[n] for n in ti.static(range(3))]
     if ti.static(config.relief):
@@ -231,7 +322,17 @@ def _light_tissue(x, y, depth, normal: ti.template(), slope_x, slope_y, column, 
     cosine, mirror, nearness, _ = _illuminate(x, y, depth, tilted, uniforms)
     diffuse = ti.max(cosine + uni.WRAP, 0.0) * (1.0 / (1.0 + uni.WRAP)) * nearness * uniforms[uni.LIGHT_NORMALISATION]
     factor = uniforms[uni.AMBIENT] + (1.0 - uniforms[uni.AMBIENT]) * diffuse
-    gloss = _specular(mirror) * nearness * (255.0 * uniforms[uni.GLOSS])
+    return factor, _specular(mirror) * nearness * (255.0 * uniforms[uni.GLOSS])
+
+
+@ti.func
+def _attenuate(light, highlight, x, y, depth, column, row, band: ti.template()):
+    """Return a factor and the gloss, as `_reflect`, with the shade of the instruments and the vignette.
+
+    `column` and `row` are the distorted positions of the samples in the picture.
+    """
+    config, uniforms = ti.static((band.config, band.uniforms))
+    factor, gloss = light, highlight
     if ti.static(len(config.shapes) > 0):
         transmission = _light_transmission(x, y, depth, band)
         factor, gloss = factor * transmission, gloss * transmission
@@ -309,24 +410,49 @@ def _bilinear(upper_left, upper_right, lower_left, lower_right, u, v):
 
 
 @ti.func
-def _fetch(first, width, height, x, y, texels: ti.template(), config: ti.template()):
-    """Interpolate a level, `width` x `height` texels from `first` on, bilinearly at column x and row y.
+def _texels_around(first, width, height, x, y, config: ti.template()):
+    """Return the texels around column x and row y of a level of `width` x `height` texels from `first` on.
 
-    Return the colour; with a relief, also the gradient of the grey level, to the right and down [1/texel].
+    They are indices of the upper left and right and the lower left and right one; then the fractions right and down.
     """
     # The texture is constant beyond the centres of its outermost texels.
     texel_x = ti.max(ti.min(x, width - 1.0), 0.0)
     texel_y = ti.max(ti.min(y, height - 1.0), 0.0)
     floor_x, floor_y = ti.floor(texel_x), ti.floor(texel_y)
-    u, v = texel_x - floor_x, texel_y - floor_y
     left, row = _to_integers(floor_x, config), _to_integers(floor_y, config)
     right = ti.min(left + 1, width - 1)
     upper = row * width + first
     lower = ti.min(row + 1, height - 1) * width + first
-    ul, ur = _fetch_rgb(upper + left, texels, config), _fetch_rgb(upper + right, texels, config)
-    ll, lr = _fetch_rgb(lower + left, texels, config), _fetch_rgb(lower + right, texels, config)
+    return upper + left, upper + right, lower + left, lower + right, texel_x - floor_x, texel_y - floor_y
+
+
+@ti.func
+def _grey(first, width, height, x, y, texels: ti.template(), config: ti.template()):
+    """Interpolate the grey level of a level, as `_texels_around`, bilinearly at column x and row y."""
+    ul, ur, ll, lr, u, v = _texels_around(first, width, height, x, y, config)
+    corners = [_fetch_rgb(index, texels, config) for index in ti.static((ul, ur, ll, lr))]
+    grey = [(corner[0] + corner[1] + corner[2]) * (1.0 / 3.0) for corner in ti.static(corners)]
+    return _bilinear(grey[0], grey[1], grey[2], grey[3], u, v)
+
+
+@ti.func
+def _fetch(first, width, height, x, y, texels: ti.template(), config: ti.template()):
+    """Interpolate a level, as `_texels_around`, bilinearly at column x and row y.
+
+    Return the colour; with a relief, also the gradient of the grey level, to the right and down [1/texel].
+    """
+    upper_left, upper_right, lower_left, lower_right, u, v = _texels_around(first, width, height, x, y, config)
+    ul, ur = _fetch_rgb(upper_left, texels, config), _fetch_rgb(upper_right, texels, config)
+    ll, lr = _fetch_rgb(lower_left, texels, config), _fetch_rgb(lower_right, texels, config)
     slope_x, slope_y = u, v
-    if ti.static(config.relief):
+    if ti.static(config.relief and config.is_pictured):
+        # Between texels half a texel away: at the centres of texels, where the light of the picture is sampled, the
+        # gradient of bilinear interpolation jumps.
+        slope_x = _grey(first, width, height, x + 0.5, y, texels, config)
+        slope_x = slope_x - _grey(first, width, height, x - 0.5, y, texels, config)
+        slope_y = _grey(first, width, height, x, y + 0.5, texels, config)
+        slope_y = slope_y - _grey(first, width, height, x, y - 0.5, texels, config)
+    elif ti.static(config.relief):
         grey_ul, grey_ur = ul[0] + ul[1] + ul[2], ur[0] + ur[1] + ur[2]
         grey_ll, grey_lr = ll[0] + ll[1] + ll[2], lr[0] + lr[1] + lr[2]
         slope_x = (grey_ur - grey_ul + (grey_lr - grey_ll - (grey_ur - grey_ul)) * v) * (1.0 / 3.0)

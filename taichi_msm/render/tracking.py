@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from taichi_msm.model.pictured import PicturedRest
 from taichi_msm.model.rest import rest_of
 from taichi_msm.render import geometry, lens_kernels
 from taichi_msm.render import uniforms as uni
@@ -20,7 +21,7 @@ from taichi_msm.render.camera import Shot
 from taichi_msm.render.config import INFINITY, Bytes, Doubles, Floats, Integers, is_present
 from taichi_msm.render.coverage import intersect_instrument
 from taichi_msm.render.geometry import NODE_STRIDE
-from taichi_msm.render.labels import NO_FLOW, Flow, Labels, Sight
+from taichi_msm.render.labels import NO_FLOW, Flow, Labels, PicturedLabels, Sight
 from taichi_msm.render.undistortion import undistorted_view
 from taichi_msm.scene.scene import Scene
 from taichi_msm.system.launches import Launches, end_thread
@@ -46,17 +47,30 @@ NOT_VISIBLE = math.nan
 
 def locate_points(scene: Scene, coordinates: Array, shot: Shot) -> Sight:
     """Project material points, with coordinates as in `Labels`, shape (n, 2), and determine their occlusion."""
-    pixels, hidden = _track(scene, coordinates, shot)
-    if (mask := rest_of(scene.sheet).mask) is not None:
-        is_missing = ~mask.covers(coordinates, COORDINATE_TOLERANCE)
-        pixels[is_missing], hidden[is_missing] = NOT_VISIBLE, True
+    rest = rest_of(scene.sheet)
+    places = np.asarray(coordinates, float)
+    pixels, hidden = _track(scene, rest.mesh_places(places), shot)
+    is_missing = ~rest.covers(places, COORDINATE_TOLERANCE)
+    pixels[is_missing], hidden[is_missing] = NOT_VISIBLE, True
     return Sight(pixels, hidden.view(np.bool_))
 
 
-def compute_flow(scene: Scene, coordinates: Array, shot: Shot) -> Flow:
-    """Compute the optical flow from another frame, with these coordinates in its `Labels`, to this one."""
-    shape = coordinates.shape[:2]
-    moved, hidden = _track(scene, coordinates.reshape(-1, 2), shot, as_flow=True)
+def mesh_of(scene: Scene, labels: Labels) -> Array:
+    """Return the (u, v) of labels, shape (height, width, 2), NaN where the sheet is not visible."""
+    coordinates, rest = np.asarray(labels.coordinates), rest_of(scene.sheet)
+    if not isinstance(rest, PicturedRest):
+        return coordinates
+    if isinstance(labels, PicturedLabels):
+        return labels.mesh
+    on_sheet, mesh = ~np.isnan(coordinates[..., 0]), np.full(coordinates.shape, np.nan)
+    mesh[on_sheet] = rest.mesh_places(coordinates[on_sheet].astype(float))
+    return mesh
+
+
+def compute_flow(scene: Scene, mesh: Array, shot: Shot) -> Flow:
+    """Compute the optical flow from another frame, whose labels have this `mesh_of`, to this one."""
+    shape = mesh.shape[:2]
+    moved, hidden = _track(scene, mesh.reshape(-1, 2), shot, as_flow=True)
     return Flow(moved.reshape(*shape, 2), hidden.reshape(shape) * np.uint8(255))
 
 
@@ -65,7 +79,7 @@ def compute_stereo(scene: Scene, labels: Labels, shot: Shot) -> Flow:
     view = shot.view
     assert view.companion is not None
     companion_shot = shot._replace(view=view.companion)
-    flow, occlusion = compute_flow(scene, labels.coordinates, companion_shot)
+    flow, occlusion = compute_flow(scene, mesh_of(scene, labels), companion_shot)
     instrument_pixels = np.argwhere(labels.instrument)
     if len(instrument_pixels):
         y, x = instrument_pixels.T
@@ -98,7 +112,7 @@ def _track(
 ) -> tuple[NDArray[np.float32], NDArray[np.uint8]]:
     """Return the pixels of points, or with `as_flow` their flow, and their occlusion.
 
-    The points are coordinates of material points, shape (n, 2), or points of instruments [m], shape (n, 3). For the
+    The points are (u, v) of material points, shape (n, 2), or points of instruments [m], shape (n, 3). For the
     flow from another frame, they are those at the centres of its pixels, row by row.
     """
     total, is_material, view, instruments = len(points), points.shape[-1] == 2, shot.view, shot.instruments
@@ -117,8 +131,8 @@ def _track(
     if view.lens is not None:
         uni.set_lens(uniform_values, view, 1, view.lens.limit)
     uniforms = launches.upload(uniform_values)
-    sizes = uni.sizes_of(scene, np.empty((0, 3), np.int32))
-    sizes[[uni.INSTRUMENT_COUNT, uni.WIDTH, uni.HEIGHT]] = len(instruments), width, height
+    sizes = uni.sizes_of(scene, np.empty((0, 3), np.int32), (width, height))
+    sizes[uni.INSTRUMENT_COUNT] = len(instruments)
     nodes, outlines = (launches.array(np.float64, n) for n in (rows * cols * NODE_STRIDE, cells * CELL_STRIDE))
     bounds = launches.array(np.int32, cells * BOUNDS_STRIDE)
     position = np.ascontiguousarray(shot.positions, np.float64)

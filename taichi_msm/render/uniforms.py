@@ -76,20 +76,24 @@ DEPTH_TOLERANCE = 56
 LENS, LENS_RADIUS, PICTURE_X, PICTURE_Y, FOCAL_X, FOCAL_Y, VISIBLE = 57, *range(65, 71)
 SAGITTA_FACTOR, STRETCH_FACTOR = 74, 75
 
+# Of a picture by a camera: the coefficients of its lens; the limit of the lens at depth 1 [m]; the principal point, and
+# the focal lengths [texels].
+PICTURE_LENS, PICTURE_LENS_RADIUS, TEXEL_X, TEXEL_Y, TEXEL_FOCAL_X, TEXEL_FOCAL_Y = 76, *range(84, 89)
+
 # The instruments, each with the centre of its tip and its axis in the camera's frame, its length and radius [m], its
 # bounding box in the undistorted picture [samples], and the number of its shape.
-INSTRUMENTS, INSTRUMENT_STRIDE = 76, 13
+INSTRUMENTS, INSTRUMENT_STRIDE = 89, 13
 TIP, AXIS, LENGTH, RADIUS, LEFT, TOP, RIGHT, BOTTOM, KIND = 0, 3, 6, 7, 8, 9, 10, 11, 12
 KINDS = {name: float(number) for number, name in enumerate(SHAPES)}
 
 
-def sizes_of(scene: Scene, levels: NDArray[np.int32]) -> NDArray[np.int32]:
-    """Return the array of sizes and counters of a scene, 0 where they vary by frame; `levels` as from `pyramid`."""
+def sizes_of(scene: Scene, levels: NDArray[np.int32], size: tuple[int, int]) -> NDArray[np.int32]:
+    """Return the array of sizes and counters of a picture, 0 where they vary by frame; `levels` as from `pyramid`."""
     mask = rest_of(scene.sheet).mask
     bits = np.empty(0, np.uint8) if mask is None else np.packbits(mask.cells, bitorder="little")
     words = np.pad(bits, (0, -bits.size % 4)).view("<i4")
     sizes = np.concatenate([np.zeros(LEVELS, np.int32), levels.ravel(), words], dtype=np.int32)
-    sizes[[ROWS, COLS, WIDTH, HEIGHT, LEVEL_COUNT]] = *scene.sheet.points, *scene.render.size, len(levels)
+    sizes[[ROWS, COLS, WIDTH, HEIGHT, LEVEL_COUNT]] = *scene.sheet.points, *size, len(levels)
     return sizes
 
 
@@ -134,6 +138,18 @@ def set_lens(uniforms: Array, view: View, supersample: int, radius: float) -> No
     uniforms[LENS : LENS + len(view.lens.coefficients)] = view.lens.coefficients
     uniforms[LENS_RADIUS] = radius
     uniforms[PICTURE_X:FOCAL_X], uniforms[FOCAL_X:VISIBLE] = view.centre * supersample, view.scale * supersample
+
+
+def set_picture(uniforms: Array, picture: View, view: View, scene: Scene) -> None:
+    """Set the uniforms of a picture by a camera, whose view is in texels; its relief is seen from that camera."""
+    if picture.lens is not None:
+        uniforms[PICTURE_LENS : PICTURE_LENS + len(picture.lens.coefficients)] = picture.lens.coefficients
+        uniforms[PICTURE_LENS_RADIUS] = picture.lens.limit
+    # The centre of the first texel is (0, 0) in the kernel.
+    uniforms[TEXEL_X:TEXEL_FOCAL_X], uniforms[TEXEL_FOCAL_X:INSTRUMENTS] = picture.centre - 0.5, picture.scale
+    height = scene.render.light.relief / 100 / 255 * rest_of(scene.sheet).extent
+    uniforms[ACROSS:UP], uniforms[UP:SLOPE_X] = view.axes @ picture.axes[0], view.axes @ picture.axes[1]
+    uniforms[SLOPE_X:DEPTH_TOLERANCE] = height * picture.scale * (1, -1) / picture.distance
 
 
 def _instrument_uniforms(solid: Solid, view: View, supersample: int) -> Array:

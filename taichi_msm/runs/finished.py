@@ -16,7 +16,7 @@ from pydantic import TypeAdapter
 
 from taichi_msm.errors import FilesError, SceneError, require_path
 from taichi_msm.images import PictureError, file_sha256, read_rgb, use_folder
-from taichi_msm.model.mask import Mask
+from taichi_msm.model.geometry import Rest
 from taichi_msm.model.rest import rest_of
 from taichi_msm.model.sheet import rest_positions
 from taichi_msm.render.camera import camera_problems
@@ -122,12 +122,15 @@ class FinishedRun:
             raise damaged_result(path)
         return sheet.with_frozen_surface(None, KeptGrid.of(grid))
 
-    def mask(self) -> Mask | None:
-        """Return the cells that are sheet, None for all; a FilesError unless the file has the SHA-256 of the run."""
-        if self.scene.sheet.mask is None:
+    def rest(self) -> Rest | None:
+        """Return the sheet at rest with its mask and its picture by a camera, None without both.
+
+        Raise a FilesError unless its files have the SHA-256 of the run.
+        """
+        if self.scene.sheet.mask is None and self.scene.calibrated_size is None:
             return None
         self._require_same(self.scene.sheet.files)
-        return rest_of(self.scene.sheet).mask
+        return rest_of(self.scene.sheet)
 
     def has_output(self, key: str) -> bool:
         """Return whether the results contain the files of an entry of `output`."""

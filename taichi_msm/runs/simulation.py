@@ -31,7 +31,7 @@ from taichi_msm.model.rest import rest_of
 from taichi_msm.model.surface import Surface, place_instruments, refine_surface, to_positions
 from taichi_msm.render.camera import Shot
 from taichi_msm.render.labels import Flow, FrameOutputs, Labels, Sight
-from taichi_msm.render.picking import pick
+from taichi_msm.render.picking import pick, place_on_sheet
 from taichi_msm.render.renderer import Array, CameraLike, Renderer
 from taichi_msm.render.texture import require_texture
 from taichi_msm.runs.player import Player, jpeg_data_url
@@ -300,7 +300,7 @@ class Simulation(AbstractContextManager["Simulation"]):
 
     def surface(self) -> Surface:
         """Return the refined surface as a triangle mesh with texture coordinates."""
-        return refine_surface(self.positions(), self.scene.render.refine, rest_of(self.scene.sheet).mask)
+        return refine_surface(self.positions(), self.scene.render.refine, rest_of(self.scene.sheet))
 
     def diagnose(self, start: Snapshot | None = None, pause: Pause = lambda: None) -> Diagnosis:
         """Find the cause of a divergence in `advance`. The simulation needs `restore` before the next `advance`.
@@ -413,8 +413,8 @@ class Simulation(AbstractContextManager["Simulation"]):
         if not (is_real_array(point, (2,)) and np.isfinite(point).all()):
             raise ArgumentError(f"pixel: {pixel!r}; take two numbers, x to the right and y down")
         x, y = point.tolist()
-        view, mask = self.renderer.resolve_camera(camera, self.time), rest_of(self.scene.sheet).mask
-        return pick(self.positions(), self.scene.render.refine, view, (x, y), mask)
+        view, rest = self.renderer.resolve_camera(camera, self.time), rest_of(self.scene.sheet)
+        return place_on_sheet(rest, pick(self.positions(), self.scene.render.refine, view, (x, y), rest.mask))
 
     def observe(
         self,

@@ -189,7 +189,9 @@ class LabelWriter:
         self._frame_outputs = [output for output in selected if output.source in ("labels", "flow", "stereo")]
         self._writes_camera = any(OUTPUTS[name].needs_camera for names in scene.folders.values() for name in names)
         # Tracks stay in memory until `finish`, as their arrays are ordered by track, not by frame.
-        self._grid = track_grid(scene.render.tracks, rest_of(scene.sheet).mask)
+        rest = rest_of(scene.sheet)
+        self._grid = track_grid(scene.render.tracks, rest)
+        self._mesh = rest.mesh_places(self._grid.astype(float)).clip(0, 1)
         shape = len(self._grid) if scene.asks_for("tracks") else 0, scene.time.frames + 1
         self._pixels, self._occluded = np.empty((*shape, 2), np.float32), np.empty(shape, np.bool_)
         self._position = np.empty((*shape, 3), np.float32)
@@ -207,7 +209,7 @@ class LabelWriter:
                     _LABEL_WRITERS[path.suffix](file, getattr(labels, output.name))
         if observed.tracks is not None:
             self._pixels[:, frame], self._occluded[:, frame] = observed.tracks
-            self._position[:, frame] = surface_positions(position, self._scene.render.refine, self._grid)
+            self._position[:, frame] = surface_positions(position, self._scene.render.refine, self._mesh)
 
     def finish(self, frames: int) -> None:
         """Write camera.json and the tracks of the first `frames` frames, and delete the files of later ones."""

@@ -15,6 +15,12 @@ from taichi_msm.scene.surface import Frame
 # A camera at the origin that looks along -z, with x to the right and y up, in the convention of `Pose`.
 POSE_AT_ORIGIN = {"rotation": [[1, 0, 0], [0, -1, 0], [0, 0, -1]], "translation": [0, 0, 0]}
 
+# The light on a picture by a camera by default: the gloss is in the picture.
+MATTE = {"gloss": 0.0}
+
+# Name of the camera of a picture in a scene with another main camera.
+PICTURE = "picture"
+
 # Name of the main camera in `picture` if it has none.
 MAIN = "main"
 
@@ -37,12 +43,14 @@ def framed_image_size(data: Mapping[str, Any]) -> tuple[int, int] | None:
 
 
 def complete_framed(data: Mapping[str, Any], size: tuple[int, int] | None) -> Mapping[str, Any]:
-    """Add to the sections of a scene the size of its image, if it is known, and the pose of a depth map's camera."""
+    """Add to a scene the size of its image, if it is known, the light, and the pose of a depth map's camera."""
     render, depth = data.get("render", {}), _get(data, "sheet", "surface", "depth")
     if not isinstance(render, Mapping):
         return data
     if size is not None:
         render = {"size": size, **render}
+    if isinstance(light := render.get("light", {}), Mapping):
+        render = {**render, "light": {**MATTE, **light}}
     cameras = render.get("cameras")
     if depth is not None and isinstance(render.get("camera"), Mapping):
         render = {**render, "camera": _at_origin(render["camera"])}
@@ -99,6 +107,27 @@ def frame_sheet(
     cameras = _chain(render, name, key)
     frame = Frame(cameras, size, region or (0, 0, *size), sheet.points)
     return sheet if frame == surface.frame else sheet.model_copy(update={"surface": surface.with_frame(frame)})
+
+
+def keep_picture_camera(sheet: Sheet, before: Render, after: Render) -> tuple[Sheet, Render]:
+    """Return a sheet and its render section, with another main camera, such that the picture keeps its camera.
+
+    If that is the main camera, it becomes a further one.
+    """
+    surface = sheet.surface
+    if surface is None or surface.frame_key is None or after.main_camera == before.main_camera:
+        return sheet, after
+    name = surface.depth.camera if surface.depth else surface.picture
+    if name not in (None, before.main) and not (name == MAIN and MAIN not in before.all_cameras):
+        return sheet.with_kept_frame(), after
+    cameras = {before.main or MAIN: after.main_camera, **after.all_cameras, PICTURE: before.main_camera}
+    cameras.pop("", None)
+    if surface.depth:
+        surface = surface.model_copy(update={"depth": surface.depth.model_copy(update={"camera": PICTURE})})
+    else:
+        surface = surface.model_copy(update={"picture": PICTURE})
+    render = {name: value for name, value in after if name in after.model_fields_set - {"camera"}}
+    return sheet.model_copy(update={"surface": surface}), Render(**{**render, "cameras": cameras})
 
 
 def region_fault(region: tuple[int, int, int, int], size: tuple[int, int] | None) -> str:

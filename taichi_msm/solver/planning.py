@@ -275,8 +275,8 @@ def steer_plan(plan: Plan, probes: Sequence[Probe | Mapping[str, Any] | None], n
         raise ArgumentError(f"probes: {len(probes)} given, but the scene has {len(before)}; give all of them")
     given = [_fill_omitted_keys(*pair) for pair in zip(before, probes, strict=True)]
     after = plan.with_probes(given)
-    joined, mask = list(after.scene.probes), rest_of(plan.scene.sheet).mask
-    lines = [] if mask is None else [str(problem) for problem in place_problems(after.scene, mask)]
+    joined = list(after.scene.probes)
+    lines = [str(problem) for problem in place_problems(after.scene, rest_of(plan.scene.sheet))]
     for index, (old, new) in enumerate(zip(before, after.scene.probes, strict=True)):
         if old.moved and new.moved and old != new:
             lines += [str(problem) for problem in _path_problems(plan, index, old, new, now)]

@@ -25,6 +25,7 @@ from taichi_msm.render.picking import pick_at_rest
 from taichi_msm.render.texture import load_texture
 from taichi_msm.runs.media import Picture
 from taichi_msm.runs.simulation import Simulation
+from taichi_msm.scene.framing import keep_picture_camera
 from taichi_msm.scene.scene import Scene
 from taichi_msm.scene.section import MAX_PROBES
 from taichi_msm.scene.tools import Probe
@@ -164,8 +165,10 @@ class Session(AbstractContextManager["Session"]):
         frames = max(1, self.frame + bool(self.divergence_error))
         time = self.scene.time.model_copy(update={"duration": frames / self.frame_rate, "tolerance": None})
         probes = (*self._scene_probes, self.tool.recorded_probe(frames))
-        render = self.viewport.recorded_render(time.duration)
-        return self.scene.model_copy(update={"probes": probes, "time": time, "render": render})
+        sheet, render = keep_picture_camera(
+            self.scene.sheet, self.scene.render, self.viewport.recorded_render(time.duration)
+        )
+        return self.scene.model_copy(update={"probes": probes, "time": time, "render": render, "sheet": sheet})
 
     def handle(self, event: events.Event) -> None:
         """Process an event, with effect from the next frame on; raise a FilesError if a file cannot be saved."""
@@ -495,8 +498,8 @@ def _force_tool(plan: Plan, scene_probes: Sequence[Probe]) -> ForceControlledToo
     probe = next((probe for probe in plan.scene.probes if not probe.moved), None)
     if probe is None:
         return None
-    start, mask = clear_start(probe, scene_probes, plan.scene), rest_of(plan.scene.sheet).mask
-    return ForceControlledTool(probe, plan.grid.frames_per_second, start, mask)
+    start = clear_start(probe, scene_probes, plan.scene)
+    return ForceControlledTool(probe, plan.grid.frames_per_second, start, rest_of(plan.scene.sheet))
 
 
 def _position_tool(plan: Plan, scene_probes: Sequence[Probe]) -> PositionControlledTool | None:

@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from taichi_msm.model.mask import Mask
+from taichi_msm.model.geometry import Rest
 from taichi_msm.model.plan import Plan
 from taichi_msm.model.rest import rest_of
 from taichi_msm.model.tool_force import control_points
@@ -42,9 +42,8 @@ def clear_start(probe: Probe, scene_probes: Sequence[Probe], scene: Scene) -> Sh
 
     Otherwise it is the first one on the sheet, or else the middle of the cell nearest to the centre.
     """
-    mask, starts = rest_of(scene.sheet).mask, STARTS
-    if mask is not None:
-        starts = tuple(start for start in STARTS if mask.covers(np.array([start]))[0]) or (_central_cell(mask),)
+    rest = rest_of(scene.sheet)
+    starts = tuple(start for start in STARTS if rest.covers(np.array([start]))[0]) or (_central_cell(rest),)
     if probe.instrument is None:
         return starts[0]
     others = [_capsule(each, scene.sheet) for each in scene_probes if each.instrument is not None]
@@ -55,8 +54,9 @@ def clear_start(probe: Probe, scene_probes: Sequence[Probe], scene: Scene) -> Sh
     return starts[0]
 
 
-def _central_cell(mask: Mask) -> SheetPosition:
-    middles = (np.argwhere(mask.cells)[:, ::-1] + 0.5) / mask.cells.shape[::-1]
+def _central_cell(rest: Rest) -> SheetPosition:
+    cells = rest.present
+    middles = rest.sheet_places((np.argwhere(cells)[:, ::-1] + 0.5) / cells.shape[::-1])
     across, down = middles[np.abs(middles - CENTRE).max(axis=1).argmin()].tolist()
     return on_sheet((across, down))
 
@@ -95,11 +95,11 @@ class ForceControlledTool:
     """
 
     def __init__(
-        self, probe: Probe, frame_rate: float, start: SheetPosition = CENTRE, mask: Mask | None = None
+        self, probe: Probe, frame_rate: float, start: SheetPosition = CENTRE, rest: Rest | None = None
     ) -> None:
         self.strength = 100.0  # force of a press [% of the full force]
         self.probe = probe
-        self._frame_rate, self._start, self._mask = frame_rate, start, mask
+        self._frame_rate, self._start, self._rest = frame_rate, start, rest
         self.reset()
 
     def reset(self) -> None:
@@ -189,7 +189,7 @@ class ForceControlledTool:
 
     def _has_gap(self, start: tuple[float, ...], end: SheetPosition) -> bool:
         """Return whether a straight line leaves the sheet."""
-        return self._mask is not None and self._mask.first_gap(np.array(start), np.array(end)) is not None
+        return self._rest is not None and self._rest.first_gap(np.array(start), np.array(end)) is not None
 
     def _as_probe(
         self, load: Sequence[tuple[float, float]], at: Sequence[tuple[float, float, float]], end: float

@@ -16,6 +16,7 @@ from taichi_msm.render.renderer import Renderer
 from taichi_msm.runs.media import Picture
 from taichi_msm.scene.camera import Camera
 from taichi_msm.scene.render import AnyCamera, Render
+from taichi_msm.scene.scene import Scene
 
 
 class Viewport:
@@ -35,9 +36,9 @@ class Viewport:
     def set_camera(self, camera: AnyCamera) -> None:
         """Set the main camera; the other cameras of the rig move with it."""
         if isinstance(camera, Camera) and not self._plays:
-            camera = frozen_camera(camera, 0.0)
+            camera = frozen_camera(camera, self._renderer.scene, 0.0)
         self.render = self.render.with_main(camera)
-        self.view = view(self._renderer.scene.model_copy(update={"render": self.render, "output": ()}), self._time)
+        self.view = view(self._scene().model_copy(update={"output": ()}), self._time)
 
     def set_time(self, time: float) -> bool:
         """Move the camera to its pose at a time [s]; return whether it is a moving camera."""
@@ -59,8 +60,12 @@ class Viewport:
     def turn(self, right: float, down: float) -> None:
         """Orbit the camera as if the near side of the tissue were dragged [px]; the picture's height is half a turn."""
         angle = math.pi / self.render.size[1]
-        scene = self._renderer.scene.model_copy(update={"render": self.render})
-        self.set_camera(orbit_camera(pinhole(scene, self._time), -right * angle, down * angle))
+        self.set_camera(orbit_camera(pinhole(self._scene(), self._time), -right * angle, down * angle))
+
+    def _scene(self) -> Scene:
+        """Return the scene with the current camera, which does not change its surface."""
+        scene = self._renderer.scene
+        return scene.model_copy(update={"render": self.render, "sheet": scene.sheet.with_kept_frame()})
 
     def toggle_light(self) -> None:
         """Toggle the shading of the scene, or a headlight if the scene has no shading."""

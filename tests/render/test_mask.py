@@ -214,7 +214,7 @@ def test_picking_finds_the_visible_point(mask_file: Path) -> None:
 
 def test_tracks_without_sheet_are_left_out(mask_file: Path, message: Messages) -> None:
     made = masked(mask_file).model_copy(update={"output": ("tracks",)})
-    tracks = track_grid(8, rest_of(made.sheet).mask)
+    tracks = track_grid(8, rest_of(made.sheet))
     column, row = (tracks * [10, 8]).astype(int).T
     assert present(made)[row, column].all()
     assert len(tracks) < 64
