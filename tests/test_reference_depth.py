@@ -11,6 +11,7 @@ from PIL import Image
 
 from taichi_msm.model.pictured import PicturedRest
 from taichi_msm.model.rest import rest_of
+from taichi_msm.model.surface_checks import aspect
 from taichi_msm.scene.scene import Scene
 from tests.reference import depth as twin
 
@@ -104,6 +105,8 @@ def test_even_grid(name: str, tmp_path: Path) -> None:
     area = twin.mean_cell_area(start)
     least = twin.objective(rest.position, area)
     assert least < twin.objective(start, area) - 1e-3
+    e, g, corner_areas = twin.corners(rest.position)
+    assert aspect(rest) == pytest.approx(np.sqrt((e / corner_areas).mean() / (g / corner_areas).mean()), rel=1e-12)
     rng = np.random.default_rng(0)
     for _ in range(3):
         change = rng.normal(size=p.shape) / np.array(POINTS[::-1])

@@ -33,6 +33,8 @@ from tests.outputs import files, results
 from tests.runs.test_finished import record, sha256
 from tests.runs.test_resume import interrupted
 
+LARGE = "render.size=[960, 720]"
+
 
 @pytest.fixture
 def depth(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
@@ -76,7 +78,8 @@ def test_rest_file(depth: Path, device: Device) -> None:
 
 def test_repeated_run(depth: Path, program: Program, monkeypatch: pytest.MonkeyPatch, message: Messages) -> None:
     """The grid is that of rest.npz; a changed file, or a rest.npz without the grid, is refused."""
-    assert program("run", "scene.yaml", "--out", "first", "--no-estimate").returncode == 0
+    # So large that the focal length would be refused if it were that of the pictures.
+    assert program("run", "scene.yaml", "--out", "first", "--no-estimate", "--set", LARGE).returncode == 0
     refuse(monkeypatch, depth)
     (depth / "elsewhere").mkdir()
     monkeypatch.chdir(depth / "elsewhere")
@@ -99,7 +102,7 @@ def test_repeated_run(depth: Path, program: Program, monkeypatch: pytest.MonkeyP
 @pytest.mark.parametrize("grid", ["even", "given"])
 def test_resumed_run(grid: str, depth: Path, device: Device, monkeypatch: pytest.MonkeyPatch) -> None:
     """The bits of an uninterrupted run, from another folder and without a minimisation; a changed map is refused."""
-    made = load_scene("scene.yaml", {"sheet.surface.grid": grid})
+    made = load_scene("scene.yaml", [f"sheet.surface.grid={grid}", LARGE])
     run(made, "whole", threads=device.threads)
     interrupted(made, "parts", device, 4)
     before = files(Path("parts"))
@@ -117,10 +120,18 @@ def test_resumed_run(grid: str, depth: Path, device: Device, monkeypatch: pytest
         assert record(depth / "parts")[name] == record(depth / "whole")[name]
 
 
-def test_run_continues_an_unfinished_one(depth: Path, device: Device) -> None:
-    made = load_scene("scene.yaml")
-    interrupted(made, "out", device, 4)
-    assert run(load_scene("scene.yaml"), "out", threads=device.threads)["resumed"] > 0
+def test_run_continues_an_unfinished_one(depth: Path, device: Device, monkeypatch: pytest.MonkeyPatch) -> None:
+    """If both have the same grid."""
+    for is_same in (True, False):
+        interrupted(load_scene("scene.yaml", [LARGE]), "out", device, 4)
+        if not is_same:
+            (file,) = grids.user_folder().iterdir()
+            with np.load(file) as archive:
+                grid = archive["grid"]
+            grid[4, 5] += 1e-9
+            np.savez(file, grid=grid)
+            forget(monkeypatch)
+        assert (run(load_scene("scene.yaml", [LARGE]), "out", threads=device.threads)["resumed"] > 0) == is_same
 
 
 def test_chosen_mesh(depth: Path, device: Device, monkeypatch: pytest.MonkeyPatch) -> None:
