@@ -51,7 +51,11 @@ class Light(Section):
     """Light of `shading: tissue`, from a source next to the camera."""
 
     ambient: UnitInterval = key(0.2, "ambient fraction of the light", "a number, 0 to 1")
-    gloss: UnitInterval = key(0.4, "brightness of the wet highlight, as a fraction of white", "a number, 0 to 1")
+    gloss: UnitInterval = key(
+        0.4,
+        "brightness of the wet highlight, as a fraction of white; by default 0 on a picture by a camera",
+        "a number, 0 to 1",
+    )
     relief: Annotated[Number, Field(ge=-10, le=10)] = key(
         0.0, "height of white above black in the image, in percent of the sheet's larger side", "a number, -10 to 10"
     )

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -24,13 +25,13 @@ WIDTH, HEIGHT = 96, 72
 def test_session(kind: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, device: Device) -> None:
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
-    camera: dict[str, object] = {"intrinsics": {"fx": 80, "fy": 80, "cx": 47.5, "cy": 35.5}}
+    camera: dict[str, Any] = {"intrinsics": {"fx": 80, "fy": 80, "cx": 47.5, "cy": 35.5}}
     x, y = np.meshgrid((np.arange(WIDTH) - 47.5) / 80, (np.arange(HEIGHT) - 35.5) / 80)
     depth = 0.06 / (1 - 0.3 * x + 0.2 * y)
     Image.fromarray(speckle(HEIGHT, WIDTH)).save("image.png")
     np.save("depth.npy", depth)
     surface = {"depth": {"file": "depth.npy", "unit": "m"}}
-    sheet = {"points": [10, 13], "surface": surface}
+    sheet: dict[str, Any] = {"points": [10, 13], "surface": surface}
     if kind == "points":
         x, y = np.meshgrid(np.linspace(-0.6, 0.6, 13), np.linspace(-0.45, 0.45, 10))
         z = 0.06 / (1 - 0.3 * x + 0.2 * y)
