@@ -131,7 +131,7 @@ def stereo(moment: float, size: int) -> None:
 
 
 def depth_frame(moment: float) -> None:
-    """Draw the frame of the scene frame, its depth, the pressed wall at a moment [s], and the flow to the next frame."""
+    """Draw the frame of the scene frame, its depth, the wall under the probe at a moment [s], and the flow."""
     scene = load_scene(SCENES / "frame.yaml", {"output": ["png", "depth", "flow"], "time.duration": moment + 0.04})
     frame = round(moment * scene.time.frames_per_second)
     assert scene.image is not None
@@ -140,16 +140,15 @@ def depth_frame(moment: float) -> None:
         run(scene, folder, estimate_error=False)
         files = scene.image, SCENES / "textures" / "frame-depth.png", folder / "frames" / f"{frame:04}.png"
         picture, counts, pressed = (np.array(Image.open(file)) for file in files)
-        flow = np.fromfile(folder / "flow" / f"{frame:04}.flo", "<f4", offset=12).reshape(*counts.shape, 2)
+        flow: Floats = np.fromfile(folder / "flow" / f"{frame:04}.flo", "<f4", offset=12).reshape(*counts.shape, 2)
     figure, axes = plt.subplots(2, 2, figsize=(8.8, 6.6), layout="constrained")
-    length = np.where(np.abs(flow[..., 0]) < 1e9, np.hypot(*np.moveaxis(flow, -1, 0)), np.nan)
+    length = np.where(np.abs(flow[..., 0]) < 1e9, np.hypot(flow[..., 0], flow[..., 1]), np.nan)
     axes[0, 0].imshow(picture)
     figure.colorbar(axes[0, 1].imshow(0.02 * counts, cmap="viridis"), ax=axes[0, 1])
     axes[1, 0].imshow(pressed)
     figure.colorbar(axes[1, 1].imshow(length, cmap="magma"), ax=axes[1, 1])
-    rows, columns = (index[12::24, 12::24] for index in np.indices(length.shape))
-    moves = np.nan_to_num(length[rows, columns]) > 0.3
-    x, y = columns[moves], rows[moves]
+    y, x = np.nonzero(length > 0.3)
+    y, x = np.stack([y, x])[:, (y % 24 == 12) & (x % 24 == 12)]
     axes[1, 1].quiver(x, y, *flow[y, x].T, color="white", angles="xy", scale_units="xy", scale=0.15)
     titles = "a frame", "its depth [mm]", "its wall under a probe", "a label: the flow to the next frame [px]"
     for axis, title in zip(axes.flat, titles, strict=True):

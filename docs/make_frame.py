@@ -29,6 +29,7 @@ sys.path.append(str(ROOT / "scenes" / "textures"))  # for the modules that make_
 from scenes.textures.make_frame import CAMERA, SIDE, SIZE, UNIT, write_wall  # noqa: E402
 
 Floats = NDArray[np.float64]
+Sections = dict[str, Any]
 
 PAGE = ROOT / "docs" / "frame.md"
 
@@ -75,7 +76,7 @@ class Pressed(NamedTuple):
     force: Floats
 
 
-def ball(across: float, down: float) -> dict[str, Any]:
+def ball(across: float, down: float) -> Sections:
     """Return the probe, which comes from behind the camera."""
     path = [[0, across, down, 0.15], [0.5, across, down, 0.002], [1, across, down, -PRESSED]]
     return {"path": path, "instrument": {"radius": RADIUS, "shaft": [0.3, -0.3, 0.9], "length": 0.1}}
@@ -88,7 +89,8 @@ def press(folder: Path, across: float, down: float, **sections: Any) -> Pressed:
     (tool,) = run(scene, folder, estimate_error=False)["probes"]
     with np.load(folder / "rest.npz") as rest, np.load(folder / "trajectory.npz") as trajectory:
         arrays = rest["position"], rest["normal"], trajectory["position"][-1]
-        return Pressed(*(array.reshape(-1, 3) for array in arrays), np.array(tool["greatest_force_vector"]))
+    position, normal, moved = (array.reshape(-1, 3) for array in arrays)
+    return Pressed(position, normal, moved, np.array(tool["greatest_force_vector"]))
 
 
 class Trip:
@@ -104,8 +106,12 @@ class Trip:
         z = heights.reshape(count, 4, count, 4).mean(axis=(1, 3))
         np.save(folder / "wall.npy", np.stack([*np.meshgrid(axis, -axis), z], axis=-1))
         surface = {"points": {"file": str(folder / "wall.npy"), "unit": "m"}, "grid": "even"}
-        self.sections = {"image": wall["image"], "render": wall["render"], "output": ["png", "depth", "trajectory"]}
-        self.sheet: dict[str, Any] = {"points": WALL, "surface": surface, "fixed": "border"}
+        self.sections: Sections = {
+            "image": wall["image"],
+            "render": wall["render"],
+            "output": ["png", "depth", "trajectory"],
+        }
+        self.sheet: Sections = {"points": WALL, "surface": surface, "fixed": "border"}
         run(self.at_rest(), folder / "rest", estimate_error=False)
         self.view = View(folder / "rest")
         with np.load(folder / "rest" / "rest.npz") as rest:
@@ -127,10 +133,10 @@ class Trip:
     def border_distance(self) -> float:
         """Distance of the place to the visible surface at the frame's border [m]."""
         width, height = SIZE
-        across, down = np.arange(width) + 0.5, np.arange(height) + 0.5
-        border = [(across, 0.5), (across, height - 0.5), (0.5, down), (width - 0.5, down)]
-        pixels = np.concatenate([np.column_stack(np.broadcast_arrays(x, y)) for x, y in border])
-        return float(np.linalg.norm(self.view.seen(pixels) - self.place, axis=1).min())
+        row, column = np.indices((height, width))
+        is_border = (row % (height - 1) == 0) | (column % (width - 1) == 0)
+        border = self.view.seen(np.column_stack([column[is_border], row[is_border]]) + 0.5)
+        return float(np.linalg.norm(border - self.place, axis=1).min())
 
     def visible_part(self) -> Pressed:
         """Press the wall without its part outside the frame, where it is fixed."""
@@ -143,7 +149,7 @@ class Trip:
         return press(self.folder / "part", *self.fractions, sheet=sheet, **self.sections)
 
     def from_frame(
-        self, depth: Floats, unit: float = 1, points: tuple[int, int] = SHEET, left: int = 0, **keys: Any
+        self, depth: NDArray[Any], unit: float = 1, points: tuple[int, int] = SHEET, left: int = 0, **keys: Any
     ) -> Pressed:
         """Press the sheet of the frame, without some columns of pixels at its left, and a depth in a unit [m]."""
         np.save(self.folder / "depth.npy", depth)

@@ -43,7 +43,7 @@ README = ROOT / "README.md"
 DOCS = ROOT / "docs"
 PAGES = [README, ROOT / "CONTRIBUTING.md", ROOT / "CHANGELOG.md", *sorted(DOCS.glob("**/*.md"))]
 # Pages with commands, in an order in which each finds the results that it reads.
-ORDER = "first-scene own-tissue endoscope surfaces scene keys labels data-set sweep fit export error view study"
+ORDER = "first-scene own-tissue endoscope surfaces frame scene keys labels data-set sweep fit export error view study"
 WITH_COMMANDS = [README, *(DOCS / f"{name}.md" for name in ORDER.split())]
 
 # Replacements in the shipped scenes, to run all commands of the pages in little time.

@@ -17,6 +17,7 @@ from taichi_msm.cameras.view import View, pinhole_view
 from taichi_msm.model.pictured import PicturedRest
 from taichi_msm.model.rest import rest_of
 from taichi_msm.model.surface import refine_surface, surface_positions, surface_weights
+from taichi_msm.render import uniforms
 from taichi_msm.render.camera import Shot, picture_view, view, view_at
 from taichi_msm.render.labels import LABELS, Labels, track_grid
 from taichi_msm.render.picking import pick_at_rest
@@ -29,7 +30,7 @@ from taichi_msm.scene.scene import Scene
 from taichi_msm.system.runtime import Device
 from tests.lenses.test_lenses import LENSES
 from tests.reference.drawing import GBuffer, present, rasterise, refine
-from tests.reference.shading import headlight, normals, normals_at, sample, tissue
+from tests.reference.shading import headlight, minified, normals, normals_at, sample, tissue
 from tests.render.test_rasterizer import assert_same_bits_with_lanes
 from tests.scenes import scene, speckle
 
@@ -155,6 +156,25 @@ def test_frame_at_rest_of_half_the_size_is_the_reduced_picture(device: Device) -
     made = pictured(render={"shading": "tissue", "size": [WIDTH // 2, HEIGHT // 2], "supersample": 2})
     mean = speckle(HEIGHT, WIDTH).reshape(HEIGHT // 2, 2, WIDTH // 2, 2, 3).mean(axis=(1, 3))
     np.testing.assert_allclose(draw_at_rest(made), mean, rtol=0, atol=1)
+
+
+@pytest.mark.parametrize("focal", [(20, 78), (80, 19.5)], ids=["across", "down"])
+def test_mipmaps_follow_the_longer_side_of_a_sample(focal: tuple[float, float], device: Device) -> None:
+    """A camera at the same place with a quarter of a focal length has samples of four texels."""
+    fx, fy = focal
+    np.save("depth.npy", depth_map(PINHOLE))
+    narrow = {"intrinsics": {"fx": fx, "fy": fy, "cx": 47.5, "cy": 35.5}, "pose": POSE_AT_ORIGIN}
+    surface = {"depth": {"file": "depth.npy", "unit": "m", "camera": "scope"}, "grid": "given"}
+    render = {"cameras": {"narrow": narrow, "scope": PINHOLE}, "shading": "tissue", "refine": 4}
+    made = scene(image="image.png", sheet={"points": [10, 13], "mass": 1e-3, "surface": surface}, render=render)
+    frame = draw_at_rest(made)
+    covered = (frame > 0).any(axis=-1)
+    x, y = (np.arange(WIDTH) + 0.5 - 48) / fx * 80 + 49.7, (np.arange(HEIGHT) + 0.5 - 36) / fy * 78 + 34.8
+    u, v = np.meshgrid(x / WIDTH, y / HEIGHT)
+    colour, _ = minified(load_texture(made), u, v, np.full(u.shape, 4 / uniforms.FULL_RESOLUTION_TEXELS))
+    assert 0.15 < covered.mean() < 0.35
+    # The light of the picture is interpolated between pixels, and the level of the mipmap blends in from 4 texels on.
+    assert np.quantile(np.abs(frame - colour)[covered], 0.99) < 2
 
 
 def test_small_motion_with_a_relief_changes_little(device: Device) -> None:
