@@ -19,7 +19,9 @@ from numpy.typing import NDArray
 from taichi_msm.errors import SceneError, as_array, did_you_mean
 from taichi_msm.fitting.points import Pixels, PointObservation, Positions
 from taichi_msm.images import irregular_kind
+from taichi_msm.model.rest import rest_of
 from taichi_msm.scene.section import MAX_MAGNITUDE
+from taichi_msm.scene.sheet import Sheet
 from taichi_msm.system.process import available_memory
 
 Arrays = dict[str, NDArray[Any]]
@@ -33,8 +35,14 @@ SUGGESTIVE_PARTS = re.compile("visib|occlu|mask|valid|missing|lost|status|score|
 KINDS: dict[str, type[PointObservation]] = {"position": Positions, "pixel": Pixels}
 
 
-def read_observations(observed: str | Path | Mapping[str, Any], rate: float) -> PointObservation:
-    """Return the observed points of a file or mapping; `rate`: frames per second, for the times of a tracks.npz."""
+def read_observations(
+    observed: str | Path | Mapping[str, Any], rate: float, sheet: Sheet | None = None
+) -> PointObservation:
+    """Return the observed points of a file or mapping.
+
+    `rate` is in frames per second, for the times of a tracks.npz, and `sheet` for the places of a trajectory.npz; None
+    for one without the picture of a camera.
+    """
     if isinstance(observed, Mapping):
         name, names = "observed", [str(key) for key in observed]
         _require_supported(name, names)
@@ -44,7 +52,7 @@ def read_observations(observed: str | Path | Mapping[str, Any], rate: float) -> 
     else:
         name = str(observed)
         arrays, names = _read_archive(name)
-    arrays = _convert_trajectory(_apply_masks(name, arrays, rate))
+    arrays = _convert_trajectory(_apply_masks(name, arrays, rate), sheet)
     kinds = [kind for kind in KINDS if kind in arrays]
     missing = [key for key in ("time", "coordinates") if key not in arrays]
     if missing := missing + ([] if kinds else ["position or pixel"]):
@@ -104,7 +112,7 @@ def _apply_masks(name: str, arrays: Arrays, rate: float) -> Arrays:
     return arrays
 
 
-def _convert_trajectory(arrays: Arrays) -> Arrays:
+def _convert_trajectory(arrays: Arrays, sheet: Sheet | None) -> Arrays:
     """Convert the arrays of a trajectory.npz, with at most 64 points per side."""
     position = arrays.get("position")
     if position is None or position.ndim != 4 or min(position.shape[:3]) == 0 or "coordinates" in arrays:
@@ -114,6 +122,9 @@ def _convert_trajectory(arrays: Arrays) -> Arrays:
     down, across = np.meshgrid(heights, widths, indexing="ij")
     thinned = position[:, rows[:, None], cols].reshape(len(position), len(rows) * len(cols), position.shape[3])
     coordinates = np.stack([across.ravel(), down.ravel()], axis=1)
+    if sheet is not None:
+        # Rounding may move those of a picture off it.
+        coordinates = rest_of(sheet).sheet_places(coordinates).clip(0, 1)
     return {**arrays, "coordinates": coordinates, "position": thinned.swapaxes(0, 1)}
 
 

@@ -144,7 +144,8 @@ def fit(
 def _read_problem(observed: Any, request: Request) -> tuple[FitProblem, MapSettings | None]:
     """Return the problem of a fit to points and forces, and the settings of its map, None for a fit of numbers."""
     initial, free, bounds, forces, method = request
-    points = read_observations(observed, initial.time.frames_per_second).with_sigma(method.get("sigma"))
+    points = read_observations(observed, initial.time.frames_per_second, initial.sheet)
+    points = points.with_sigma(method.get("sigma"))
     points = points.on_sheet(initial)
     if unused := [name for name in TABLE_OPTIONS if method.get(name)]:
         raise SceneError([f"--{unused[0]}: only for tables of a testing machine; leave it out"])

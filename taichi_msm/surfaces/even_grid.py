@@ -105,6 +105,8 @@ def _inverse_hessian(surface: Surface, objective: GridObjective, p: Array) -> Ca
     def solve(values: Array, weight: float, other_weight: float) -> Array:
         """Solve for one component, which is 0 at both ends of axis 0, for the weights of differences along the axes."""
         n, m = (count - 1 for count in values.shape)
+        if n == 1:  # All points are at an end.
+            return np.zeros_like(values)
         end_weights = np.ones(m + 1)
         end_weights[[0, -1]] = 0.5
         along, other = np.pi * np.arange(1, n) / n, np.pi * np.arange(m + 1) / m

@@ -326,6 +326,18 @@ def test_schema(depth: Path) -> None:
         write_points("\n    picture: main\n    grid: even")
 
 
+def test_least_sizes(depth: Path, message: Messages) -> None:
+    """Two mass points a side, of which none is free, and two pixels."""
+    for points in ([2, 2], [2, 3]):
+        sheet = load_scene("scene.yaml", {"sheet.points": points}).sheet
+        corners = rest_of(sheet).position[np.ix_([0, -1], [0, -1])]
+        given = rest_of(load_scene("scene.yaml", {"sheet.points": points, "sheet.surface.grid": "given"}).sheet)
+        np.testing.assert_allclose(corners, given.position[np.ix_([0, -1], [0, -1])], rtol=0, atol=1e-15)
+    load_scene("scene.yaml", {"region": [0, 0, 2, 2]})
+    with message.raises(SceneError, "scene.yaml:5:13: sheet.surface.depth.file: depth.npy has 1 x 9 pixels"):
+        load_scene("scene.yaml", {"region": [0, 0, 1, 9]})
+
+
 def test_depth_without_an_end(depth: Path, message: Messages) -> None:
     """A map whose inverse depth falls to the right, where a quarter of it is missing."""
     inverse = np.tile(np.linspace(1, 0.1, WIDTH), (HEIGHT, 1))
