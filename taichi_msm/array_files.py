@@ -34,7 +34,7 @@ class ArrayFile:
 
     values: NDArray[Any]  # float64, of depth maps as in the file
     sha256: str  # of the file
-    step: float  # the values are multiples of it, but for an offset [m]; 0 for floating-point numbers
+    step: float  # of heights, which are multiples of it but for an offset [m]; 0 for floating-point numbers
 
 
 def read_array_file(

@@ -36,6 +36,9 @@ MAX_BYTES = 2**31
 # Path of the copy that is read in place of a file, by path of the file.
 _copies: Mapping[str, Path] = {}
 
+# Folder to which other paths are relative.
+_folder = Path()
+
 
 class PictureError(Exception):
     """A file cannot be used as a picture."""
@@ -57,6 +60,17 @@ def use_copies(copies: Mapping[str, Path]) -> Iterator[None]:
         yield
     finally:
         _copies = previous
+
+
+@contextmanager
+def use_folder(folder: str | Path) -> Iterator[None]:
+    """Let paths of files be relative to a folder within the block."""
+    global _folder
+    previous, _folder = _folder, Path(folder)
+    try:
+        yield
+    finally:
+        _folder = previous
 
 
 def read_rgb(path: str, background: tuple[int, int, int], sha256: str | None = None) -> Image.Image:
@@ -93,6 +107,7 @@ def read_depth(path: str, sha256: str | None = None) -> NDArray[Any]:
     from PIL import ImageOps
 
     with _open(path, sha256, (*_MODES_16_BIT, "L", "F")) as opened:
+        require_memory(path, DECODING_BYTES * opened.width * opened.height, "scale it down")
         image = ImageOps.exif_transpose(opened)
         return np.asarray(image).astype(np.uint16) if image.mode in _MODES_16_BIT else np.asarray(image)
 
@@ -138,6 +153,7 @@ def _open(path: str, sha256: str | None = None, modes: Sequence[str] = _MODES) -
     from PIL import Image, UnidentifiedImageError
 
     _require_file(path)
+    is_colour, one_channel = modes == _MODES, "save one number a pixel, or an .npy array"
     # libtiff and Pillow also print the errors that they raise.
     with discarded_output(2), warnings.catch_warnings():
         warnings.simplefilter("ignore")
@@ -161,13 +177,14 @@ def _open(path: str, sha256: str | None = None, modes: Sequence[str] = _MODES) -
                     if scans > limit:
                         raise PictureError(f"{path} has {scans} scans, more than {limit}", "save it again")
                 if image.mode not in modes:
-                    remedy = "save it as 8-bit RGB" if modes == _MODES else "save one number a pixel, or an .npy array"
+                    remedy = "save it as 8-bit RGB" if is_colour else one_channel
                     raise PictureError(f"{path} has pixels of kind {image.mode}", remedy)
                 yield image
         except PictureError:
             raise
         except UnidentifiedImageError:
-            raise PictureError(f"{path} is not a PNG, JPEG, WebP, BMP or TIFF picture", "convert it") from None
+            remedy = "convert it" if is_colour else one_channel
+            raise PictureError(f"{path} is not a PNG, JPEG, WebP, BMP or TIFF picture", remedy) from None
         except (Image.DecompressionBombWarning, Image.DecompressionBombError):
             limit = (Image.MAX_IMAGE_PIXELS or 0) // 10**6
             raise PictureError(f"{path} has more than {limit} million pixels", "scale it down") from None
@@ -210,8 +227,8 @@ def irregular_kind(path: Path) -> str:
 
 
 def actual_path(path: str) -> Path:
-    """Return the path to read: the path itself, or that of its copy within `use_copies`."""
-    return _copies.get(path) or Path(path)
+    """Return the path to read: within `use_copies` that of its copy, within `use_folder` that in the folder."""
+    return _copies.get(path) or _folder / path
 
 
 def _require_file(path: str) -> None:

@@ -59,11 +59,13 @@ def root() -> Path:
 
 
 @pytest.fixture(scope="session", autouse=True)
-def kernel_cache(tmp_path_factory: pytest.TempPathFactory) -> None:
-    """A cache of compiled kernels for this session, its child processes and all workers of pytest-xdist."""
+def caches(tmp_path_factory: pytest.TempPathFactory) -> None:
+    """Caches of compiled kernels and grids for this session, its child processes and all workers of pytest-xdist."""
     base = tmp_path_factory.getbasetemp()
     shared = base.parent if "PYTEST_XDIST_WORKER" in os.environ else base
     os.environ[active_compiler().folder_variable] = str(shared / "kernels")
+    # Even grids would be stored in the folder of the user.
+    os.environ["XDG_CACHE_HOME"] = str(shared / "cache")
 
 
 @pytest.fixture(scope="session")

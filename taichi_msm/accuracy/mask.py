@@ -17,7 +17,7 @@ class MaskRecord(TypedDict):
 
     cells: int  # that are sheet
     rectangle: int  # number of all cells
-    parts: int  # number of parts that hang together by cells
+    parts: int  # number of connected parts
 
 
 def mask_record(scene: Scene) -> MaskRecord | None:
@@ -41,6 +41,8 @@ def mask_notes(plan: Plan) -> Iterator[str]:
     if mask is not None and loose and tissue is not None and tissue.foundation_stiffness == 0:
         row, column = np.argwhere(mask.parts == loose[0])[0].tolist()
         place = f"with the cell at row {row}, column {column}"
-        subject = f"the part {place} is" if len(loose) == 1 else f"{len(loose)} parts, the first one {place}, are"
-        remedy = "set sheet.fixed or tissue.foundation, or remove it from the mask"
-        yield f"sheet.mask: {subject} neither fixed nor on a foundation, so any load moves it away; {remedy}"
+        subject, pronoun = f"the part {place} is", "it"
+        if len(loose) > 1:
+            subject, pronoun = f"{len(loose)} parts, the first one {place}, are", "them"
+        remedy = f"set sheet.fixed or tissue.foundation, or remove {pronoun} from the mask"
+        yield f"sheet.mask: {subject} neither fixed nor on a foundation, so any load moves {pronoun} away; {remedy}"

@@ -131,10 +131,9 @@ def coarser_plan(plan: Plan, ratio: float = 0.5) -> Plan | None:
         return None
 
     def deviation(option: Scene) -> tuple[bool, float]:
-        few = option.sheet
-        return not same_outline(scene.sheet, few), sum(
-            abs(n - 1 - cell) for n, cell in zip(few.points, cells, strict=True)
-        )
+        cell_counts = (count - 1 for count in option.sheet.points)
+        distance = sum(abs(count - cell) for count, cell in zip(cell_counts, cells, strict=True))
+        return not same_outline(scene.sheet, option.sheet), distance
 
     coarse = min(valid, key=lambda option: (deviation(option), option.sheet.points))
     probes = tuple(_with_equal_force(probe, scene.sheet, coarse.sheet) for probe in scene.probes)

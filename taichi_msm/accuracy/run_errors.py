@@ -105,7 +105,7 @@ class RunErrorEstimator:
         reference = plan.with_grid(steps_per_frame=steps) if self._mesh_follows_coarse else plan
         self._mesh = None if coarse is None else MeshCompanion(reference, coarse, device, cores)
         self._squared_errors, self._contact_frames, self._max_force = np.zeros((3, len(plan.tools)))
-        self._forces: list[NDArray[np.float64]] = []  # of the tools since the previous frame, at every frame
+        self._forces: list[NDArray[np.float64]] = []  # of the tools at every frame, with a mask
 
     def compile(self) -> None:
         """Compile the kernels before the first frame."""
@@ -126,7 +126,8 @@ class RunErrorEstimator:
             self._mesh.compare_frame(coarse.displacement if coarse else displacement, pause)
         if self._plan.tools and self._mesh is not None:
             coarse_forces = self._mesh.tool_forces()
-            self._forces.append(forces)
+            if self._plan.scene.sheet.mask is not None:
+                self._forces.append(forces)
             error = FORCE_ERROR_FACTOR * np.abs(forces - coarse_forces)
             if self._time_step is not None:
                 error = np.maximum(error, self._time_step.force_error(forces))

@@ -8,24 +8,30 @@ from collections.abc import Iterator
 import numpy as np
 from typing_extensions import TypedDict
 
+from taichi_msm.accuracy.depth import depth_steps
 from taichi_msm.model.cells import cell_stiffness
 from taichi_msm.model.geometry import CurvedRest
 from taichi_msm.model.plan import Plan
 from taichi_msm.model.rest import rest_of
 from taichi_msm.model.surface_checks import (
     FOLD_REMEDY,
+    aspect,
     describe_fold,
     describe_largest,
     isotropy_remedy,
     neighbour_angles,
+    square_points,
 )
 from taichi_msm.scene.scene import Scene
 from taichi_msm.terms import fictitious_masses
 from taichi_msm.terms.elasticity import spring_families
 
-# Notes warn from these on: mean isotropy error, angle between neighbouring cells, step of heights in sides of a cell.
+# Notes warn from these on: mean isotropy error, angle between neighbouring cells, step of heights or depths in sides of
+# a cell.
 NOTED_ISOTROPY_ERROR, NOTED_ANGLE_DEGREES, NOTED_STEP = 0.1, 45.0, 1 / 20
 
+# Share of pixels without depth from which a note warns.
+NOTED_FILLED = 0.05
 
 # Extent above which, and rise relative to it below which, a wrong unit is likely.
 MAX_EXTENT_M, MIN_RISE = 5.0, 1e-3
@@ -63,8 +69,8 @@ def surface_record(scene: Scene) -> SurfaceRecord | None:
         "sha256": file.sha256 if file else None,
         "sides": [rest.shortest_side, rest.longest_side],
         "isotropy_error": {"mean": float((errors * area).sum() / area.sum()), "worst": float(errors.max())},
-        "clamped": int(cell_stiffness(rest.cells, 1.0).is_clamped[rest.present].sum()),
-        "filled": 0.0,
+        "clamped": int(cell_stiffness(rest.present_cells, 1.0).is_clamped.sum()),
+        "filled": rest.origin.filled,
     }
 
 
@@ -77,16 +83,32 @@ def surface_notes(scene: Scene) -> Iterator[str]:
     if scene.tissue is not None and isotropy["mean"] > NOTED_ISOTROPY_ERROR:
         yield (
             f"sheet.surface: the springs deviate from isotropic tissue by {isotropy['mean']:.2g} on the mean, up to "
-            f"{isotropy['worst']:.2g}; {isotropy_remedy(rest, surface.kind)}"
+            f"{isotropy['worst']:.2g}; {isotropy_remedy(rest, surface)}"
         )
     if surface.height and file and file.step > NOTED_STEP * side:
         yield (
             f"sheet.surface: heights in steps of {file.step:.3g} m, over a twentieth of a cell's side, {side:.3g} m; "
             "take a picture of 16 bits, or an array of floating-point numbers"
         )
+    if (steps := depth_steps(surface, rest)) and steps.size > NOTED_STEP * side:
+        remedy = f"depth.smooth: {steps.smooth:.2g} evens them out"
+        if rest.origin.deviation is not None and rest.origin.deviation >= steps.smooth:
+            remedy = f"smoothing by {rest.origin.deviation:.2g} px evens them out"
+        yield (
+            f"sheet.surface: depths in steps of {steps.size:.3g} m, over a twentieth of a cell's side, {side:.3g} m; "
+            f"{remedy}"
+        )
+    if (filled := rest.origin.filled) > NOTED_FILLED:
+        yield (
+            f"sheet.surface: {filled:.1%} of the pixels have no depth and are filled in from those around them; leave "
+            "large holes out by sheet.mask"
+        )
     extents = np.sort(np.ptp(rest.box, axis=0))
-    if surface.points and extents[2] > MAX_EXTENT_M:
-        yield f"sheet.surface.points: {extents[2]:.3g} m is long for tissue; if these are millimetres, take unit: mm"
+    if surface.has_own_size and extents[2] > MAX_EXTENT_M:
+        fault = f"{extents[2]:.3g} m is long for tissue; if these are millimetres, take unit: mm"
+        yield f"sheet.surface.{surface.kind}: {fault}"
+    elif surface.depth:
+        pass  # The camera may be anywhere.
     elif (distance := float(np.linalg.norm(rest.box.mean(axis=0)))) > MAX_DISTANCE * extents[2]:
         fault = f"{distance:.3g} m from the origin, {distance / extents[2]:.0f} times its length"
         yield f"sheet.surface: {fault}, where f32 and pictures lose digits; subtract the mean of its points"
@@ -103,15 +125,16 @@ def describe_surface(plan: Plan) -> Iterator[str]:
     rest, record = rest_of(plan.scene.sheet), surface_record(plan.scene)
     if not isinstance(rest, CurvedRest) or record is None:
         return
-    (rows, cols), present = plan.scene.sheet.points, rest.present
-    side_a, side_b = rest.cells.side_a[present], rest.cells.side_b[present]
-    aspect, angles = np.maximum(side_a / side_b, side_b / side_a), np.degrees(np.arccos(rest.cells.cosine[present]))
+    (rows, cols), cells = plan.scene.sheet.points, rest.present_cells
+    ratios, angles = cells.side_a / cells.side_b, np.degrees(np.arccos(cells.cosine))
+    aspect = max(ratios.max(), 1 / ratios.min())
     low, high = f"{angles.min():.0f}", f"{angles.max():.0f}"
     yield (
         f"surface: {record['kind']}, {rows} x {cols} points, cells of {rest.shortest_side:.3g} to "
-        f"{rest.longest_side:.3g} m, at most {aspect.max():.3g} times as long as wide, with sides at "
+        f"{rest.longest_side:.3g} m, at most {aspect:.3g} times as long as wide, with sides at "
         f"{low if low == high else f'{low} to {high}'} degrees"
     )
+    yield from _describe_file(rest, record)
     if plan.scene.tissue is not None:
         yield _describe_isotropy(rest, record)
     if not plan.scene.time.at_rest:
@@ -131,6 +154,17 @@ def describe_surface(plan: Plan) -> Iterator[str]:
         pressures = np.abs((pulls * rest.point_normals).sum(axis=-1)[free]) / rest.areas[free]
         largest = float(pressures.max(initial=0.0))
         yield f"surface: at rest, a pressure of up to {largest:.4g} Pa holds the pretension"
+
+
+def _describe_file(rest: CurvedRest, record: SurfaceRecord) -> Iterator[str]:
+    """Yield lines about the even grid, with the numbers of points whose cells are square, and about filled pixels."""
+    if rest.origin.grid is not None:
+        square, shape = list(square_points(rest)), list(rest.position.shape[:2])
+        remedy = "square" if square == shape else f"square with sheet.points: {square}"
+        yield f"surface: cells of the even grid are {aspect(rest):.3g} times as wide as high, {remedy}"
+    if rest.origin.deviation is not None:
+        deviation = f"smoothed by {rest.origin.deviation:.3g} px" if rest.origin.deviation else "not smoothed"
+        yield f"surface: {record['filled']:.2%} of the pixels are filled in, as they have no depth; {deviation}"
 
 
 def _describe_isotropy(rest: CurvedRest, record: SurfaceRecord) -> str:

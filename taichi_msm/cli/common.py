@@ -5,15 +5,19 @@ from __future__ import annotations
 import json
 import shlex
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from contextlib import closing, contextmanager
+from contextlib import closing, contextmanager, nullcontext
+from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import click
 
 from taichi_msm.errors import FilesError, SceneError, printable
 from taichi_msm.runs.directory import require_no_link
 from taichi_msm.system.process import Interruption, write_stderr
+
+if TYPE_CHECKING:
+    from taichi_msm.cli.console import ProgressDisplay
 
 # Exit codes; FILES: files cannot be read or written.
 DONE, BUG, INVALID_INPUT, DIVERGED, FILES = 0, 1, 2, 3, 4
@@ -72,6 +76,7 @@ def show_progress(interruption: Interruption, quiet: bool) -> Iterator[Callable[
     The callback raises a KeyboardInterrupt after an interruption, which is listened to from the first stage on.
     """
     from taichi_msm.cli.console import ProgressDisplay
+    from taichi_msm.model.grids import report_grids
 
     def progress(stage: str, done: int, total: int) -> None:
         bar.update(stage, done, total)
@@ -80,8 +85,32 @@ def show_progress(interruption: Interruption, quiet: bool) -> Iterator[Callable[
         if stage != "write":
             interruption.raise_if_requested()
 
-    with closing(ProgressDisplay(quiet=quiet)) as bar:
+    with closing(ProgressDisplay(quiet=quiet)) as bar, report_grids(partial(progress, "grid")):
         yield progress
+
+
+@contextmanager
+def show_grids(quiet: bool) -> Iterator[None]:
+    """Show the progress of even grids in the block, unless `show_progress` within it does."""
+    from taichi_msm.model.grids import report_grids
+
+    displays: list[ProgressDisplay] = []
+
+    def progress(done: int, total: int) -> None:
+        from taichi_msm.cli.console import ProgressDisplay
+
+        if not displays:
+            displays.append(ProgressDisplay(quiet=False))
+        displays[0].update("grid", done, total)
+        if done == total:
+            displays.pop().close()
+
+    try:
+        with nullcontext() if quiet else report_grids(progress):
+            yield
+    finally:
+        for display in displays:
+            display.close()
 
 
 @contextmanager

@@ -19,6 +19,7 @@ if TYPE_CHECKING:
 # Stages of computations, and their descriptions.
 STAGES = {
     "start": "starting",
+    "grid": "spreading mass points",
     "pilot": "companion runs",
     "compile": "compiling the kernels",
     "check": "checking the finished frames",

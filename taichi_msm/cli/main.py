@@ -38,7 +38,8 @@ def _run(words: list[str]) -> tuple[int, Sequence[str]]:
     except OSError:
         return common.FILES, ["taichi-msm: the current folder is gone; change to another"]
     try:
-        return int(options.program.main(words, prog_name="taichi-msm", standalone_mode=False) or common.DONE), ()
+        with common.show_grids("--quiet" in words or "--json" in words):
+            return int(options.program.main(words, prog_name="taichi-msm", standalone_mode=False) or common.DONE), ()
     except SystemExit:
         # click raises SystemExit when the reader of stdout has exited.
         raise BrokenPipeError from None

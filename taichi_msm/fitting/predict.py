@@ -74,9 +74,11 @@ class FitProblem:
 
 
 def without_outputs(scene: Scene) -> Scene:
-    """Return a scene in f64, without image and outputs."""
+    """Return a scene in f64, without outputs, and without image unless its surface is that of a picture."""
     time = scene.time.model_copy(update={"precision": "f64"})
-    return scene.model_copy(update={"image": None, "region": None, "output": (), "time": time})
+    is_framed = scene.sheet.surface is not None and scene.sheet.surface.frame_key is not None
+    unused = {} if is_framed else {"image": None, "region": None}
+    return scene.model_copy(update={**unused, "output": (), "time": time})
 
 
 class ForwardModel:

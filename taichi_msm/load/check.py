@@ -12,8 +12,9 @@ from taichi_msm.load import cost
 from taichi_msm.model.plan import Plan
 from taichi_msm.model.sheet import Maps
 from taichi_msm.render.camera import camera_problems
-from taichi_msm.render.texture import image_problems
+from taichi_msm.render.texture import image_problems, picture_problems
 from taichi_msm.scene import outputs, section
+from taichi_msm.scene.framing import is_framed
 from taichi_msm.scene.outputs import OUTPUTS
 from taichi_msm.scene.scene import Scene
 from taichi_msm.scene.section import Section
@@ -39,6 +40,8 @@ def validate(data: dict[str, Any]) -> tuple[Plan | None, list[Problem]]:
     """
     problems: list[Problem] = []
     plan = None
+    if is_framed(data) and (unreadable := list(picture_problems(data.get("image")))):
+        return None, unreadable  # Cameras and sheet depend on its size.
     # At most three passes: sections; the whole scene, which pydantic validates after all sections; combinations.
     for _ in range(3):
         scene, new_problems = parse_model(Scene, data)
@@ -107,6 +110,8 @@ def _replace_faulty(data: dict[str, Any], problems: list[Problem]) -> dict[str, 
     if "image" in faulty:
         faulty.add("output")
     output = data.get("output")
+    if is_framed(data) and faulty & {"image", "region", "render", "sheet"}:
+        faulty |= {"render", "sheet"}  # The surface and its cameras belong together.
     if "render" in faulty and isinstance(output, list):
         # Without the cameras, an output of a stereo pair cannot be checked.
         stereo = {row.entry for row in OUTPUTS.values() if row.needs_stereo_pair}

@@ -22,6 +22,7 @@ import numpy as np
 from taichi_msm.accuracy.companions import choose_companion_runs
 from taichi_msm.errors import Problem, SceneError
 from taichi_msm.images import DECODING_BYTES
+from taichi_msm.model.depth import DEPTH_PIXEL_BYTES
 from taichi_msm.model.plan import Plan
 from taichi_msm.model.time_grid import DTYPES
 from taichi_msm.render import texture
@@ -62,7 +63,8 @@ RECORD_BYTES = 1 << 16  # run.json, without its scene
 
 # Force of a probe in a frame [bytes].
 FORCE_ROW_BYTES = 180  # row of forces.csv, upper bound
-REST_BYTES = 7 * 8  # position, area and normal of a mass point at rest
+REST_BYTES = 11 * 8  # position, area and normal of a mass point at rest, and its places in a picture and a file
+GRID_BYTES = 2 * 8  # of an even grid in the checkpoint, per mass point
 FORCE_BYTES = 6 * 8  # values in the checkpoint
 
 # Numbers in memory per mass point.
@@ -128,8 +130,10 @@ def estimate_budget(plan: Plan) -> Budget:
     surface = scene.sheet.surface
     surface_bytes = surface.file.values.nbytes if surface and surface.file else 0
     surface_bytes += CURVED_BYTES * points * (surface is not None)
+    if surface and surface.depth and surface.frame:
+        surface_bytes += DEPTH_PIXEL_BYTES * math.prod(surface.frame.region[2:])
     mask_bytes = scene.sheet.mask.pixels.is_sheet.nbytes if scene.sheet.mask else 0
-    memory_numbers = len(memory_names(plan))
+    memory_numbers, has_grid = len(memory_names(plan)), surface is not None and surface.is_even
     numbers = STATE_NUMBERS + OUTPUT_NUMBERS + memory_numbers + sum(MAP_NUMBERS[name] for name in scene.maps)
     numbers += CURVED_NUMBERS * (surface is not None or scene.sheet.mask is not None)
     numbers += sum(not probe.moved for probe in scene.probes)  # the load of each force-controlled tool
@@ -147,7 +151,7 @@ def estimate_budget(plan: Plan) -> Budget:
         force_bytes=force_rows * FORCE_ROW_BYTES + FILE_BYTES if "forces" in scene.output else 0,
         record_bytes=2 * len(scene.model_dump_json(indent=2)) + RECORD_BYTES,
         # Two states (the saved one and its replacement), and the positions and forces of all frames.
-        working_bytes=2 * points * (STATE_NUMBERS + memory_numbers) * number_bytes
+        working_bytes=2 * points * ((STATE_NUMBERS + memory_numbers) * number_bytes + GRID_BYTES * has_grid)
         + (position_bytes + force_rows * FORCE_BYTES if scene.output else 0),
     )
 

@@ -5,6 +5,7 @@ Unlike validation (check.py), this starts the compiler.
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import NamedTuple
 
 from taichi_msm.accuracy.mesh import MeshEstimate, choose_points
@@ -12,6 +13,7 @@ from taichi_msm.accuracy.time_step import TimeStepEstimate, choose_step
 from taichi_msm.errors import ProgressCallback, SceneError
 from taichi_msm.load.check import check_scene
 from taichi_msm.model.plan import Plan
+from taichi_msm.model.rest import freeze_surface
 from taichi_msm.solver import planning
 from taichi_msm.solver.planning import freeze_grid
 from taichi_msm.system.runtime import Device
@@ -36,4 +38,6 @@ def resolve(plan: Plan, device: Device, progress: ProgressCallback = lambda done
         plan, mesh = choose_points(plan, device, check_scene, progress)
     if plan.scene.time.tolerance is not None:
         plan, estimate = choose_step(plan, device, progress)
-    return ResolvedPlan(freeze_grid(plan), estimate, mesh)
+    plan = freeze_grid(plan)
+    sheet = freeze_surface(plan.scene.sheet)
+    return ResolvedPlan(replace(plan, scene=plan.scene.model_copy(update={"sheet": sheet})), estimate, mesh)

@@ -33,7 +33,7 @@ MAP_KEYS: tuple[Key, ...] = (
 MASK_KEYS: tuple[Key, ...] = (("sheet", "mask"), ("sheet", "mask", "image"))
 PICTURE_KEYS = (IMAGE_KEY, *MAP_KEYS, *MASK_KEYS)
 
-# Keys of the heights and points of a surface, whose values are paths of arrays, of heights also of pictures.
+# Keys of the files of a surface, whose values are paths of arrays or pictures.
 SURFACE_KEYS: tuple[Key, ...] = tuple(("sheet", "surface", kind, "file") for kind in ("height", "depth", "points"))
 
 # Keys of a camera whose values are paths of files.

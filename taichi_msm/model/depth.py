@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from taichi_msm.arithmetic import Array
-from taichi_msm.images import PictureError
+from taichi_msm.images import PictureError, require_memory
 from taichi_msm.model.cells import Cells, unit
 from taichi_msm.model.geometry import Origin
 from taichi_msm.model.grids import kept_grid
@@ -19,9 +19,16 @@ from taichi_msm.scene.surface import DepthMap, Frame
 from taichi_msm.surfaces import depth_map
 from taichi_msm.surfaces.smoothing import smooth_inverse_depth
 from taichi_msm.surfaces.surface import Surface, depth_surface, given_grid, positions
+from taichi_msm.system.array_cache import cached_arrays
 
 # Largest share of pixels without depth, and of steep cells, those seen at more than MAX_ANGLE [degrees].
 MAX_FILLED, MAX_STEEP, MAX_ANGLE = 0.25, 0.01, 80.0
+
+# Inverse depth of pixels without sheet where it would have no end, relative to the least one of the sheet.
+MIN_INVERSE = 1e-3
+
+# Memory per pixel for smoothing and splines [bytes].
+DEPTH_PIXEL_BYTES = 450
 
 
 class Relief(NamedTuple):
@@ -30,6 +37,7 @@ class Relief(NamedTuple):
     surface: Surface  # by fractions of the picture, in the world
     filled: float  # share of pixels without depth, of those of the mask
     deviation: float  # standard deviation of the smoothing [px]
+    key: tuple[Any, ...]  # all that the surface depends on
 
 
 def depth_positions(
@@ -37,12 +45,11 @@ def depth_positions(
 ) -> tuple[Array, Origin]:
     """Return the positions of the mass points [m]; a PictureError reports a depth map that cannot be used."""
     relief = read_relief(section, frame, picture, mask)
-    _check_slopes(section, relief, picture, frame, mask)
+    if not frame.is_kept:
+        _check_slopes(section, relief, picture, frame, mask)
     if not even:
         return positions(relief.surface, given_grid(points)), Origin(None, relief.filled, relief.deviation)
-    outline = mask and (mask.pixels.sha256, mask.invert)
-    key = (section.numbers.sha256, section.unit, section.along, relief.deviation, frame.region, outline, picture.key)
-    grid = kept_grid(relief.surface, frame.points, points, key)
+    grid = kept_grid(relief.surface, frame, points, relief.key)
     return positions(relief.surface, grid), Origin(grid, relief.filled, relief.deviation)
 
 
@@ -53,6 +60,7 @@ def read_relief(section: DepthMap, frame: Frame, picture: Picture, mask: SheetMa
     if numbers.shape[1::-1] != frame.image_size:
         sizes = "{1} x {0}".format(*numbers.shape), "{} x {}".format(*frame.image_size)
         raise PictureError(f"{path} has {sizes[0]} pixels, and the image {sizes[1]}", "give the depth of every pixel")
+    require_memory(path, DEPTH_PIXEL_BYTES * width * height, "cut the region, or scale the picture down")
     known = depth_map.DepthMap.of(numbers[y : y + height, x : x + width], section.metres)
     centres = np.stack(np.meshgrid(np.arange(width) + 0.5, np.arange(height) + 0.5), axis=-1)
     corner = np.array([x, y], float)
@@ -78,12 +86,22 @@ def read_relief(section: DepthMap, frame: Frame, picture: Picture, mask: SheetMa
     if deviation == "auto":
         rows, cols = frame.points
         deviation = (width / (cols - 1) + height / (rows - 1)) / 4
-    inverse = smooth_inverse_depth(1 / known.depth, known.is_known, pixels[..., 0], pixels[..., 1], deviation)
-    if (inverse <= 0).any():
-        row, column = np.unravel_index(int((inverse <= 0).argmax()), inverse.shape)
+    outline = mask and (mask.pixels.sha256, mask.invert)
+    key = (section.numbers.sha256, section.unit, section.along, float(deviation), frame.region, outline, picture.key)
+    (inverse,) = cached_arrays(
+        ("inverse depth", repr(key)),
+        lambda: (smooth_inverse_depth(1 / known.depth, known.is_known, pixels[..., 0], pixels[..., 1], deviation),),
+    )
+    is_endless = inverse <= 0
+    if is_sheet is not None:
+        # Without sheet, where a depth matters only to the spline, the surface is as far as it may be.
+        inverse = np.where(is_endless & ~is_sheet, MIN_INVERSE * inverse[is_sheet].min(), inverse)
+        is_endless &= is_sheet
+    if is_endless.any():
+        row, column = np.unravel_index(int(is_endless.argmax()), inverse.shape)
         remedy = "cut the region, or leave the place out by sheet.mask"
         raise PictureError(f"{path}: the depth has no end at {_pixel(column, row, frame)}", remedy)
-    return Relief(_in_world(inverse, picture), filled, float(deviation))
+    return Relief(_in_world(inverse, picture), filled, float(deviation), key)
 
 
 def _pixel(column: Any, row: Any, frame: Frame) -> str:

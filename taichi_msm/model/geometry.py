@@ -220,16 +220,27 @@ class CurvedRest(Rest):
         self.position, self.mask, self.origin = position, mask, origin or Origin()
         self.position.flags.writeable = False
         self.cells = Cells.of(position)
-        present = self.present
-        self.cell_area = float(self.cells.area[present].mean())
-        self.cell_sides = float(self.cells.side_a[present].mean()), float(self.cells.side_b[present].mean())
-        sides = []
-        for axis in (0, 1):  # sides along columns, then along rows, each of the cells on both sides of it
-            padded = np.pad(present, [(0, 0), (1, 1)] if axis == 0 else [(1, 1), (0, 0)])
-            belongs = padded[:, :-1] | padded[:, 1:] if axis == 0 else padded[:-1] | padded[1:]
-            sides.append(np.linalg.norm(np.diff(position, axis=axis), axis=-1)[belongs])
-        self.shortest_side = float(min(each.min() for each in sides))
-        self.longest_side = float(max(each.max() for each in sides))
+        cells = self.present_cells
+        self.cell_area = float(cells.area.mean())
+        self.cell_sides = float(cells.side_a.mean()), float(cells.side_b.mean())
+        sides = self.side_lengths()
+        self.shortest_side = float(min(np.nanmin(each) for each in sides))
+        self.longest_side = float(max(np.nanmax(each) for each in sides))
+
+    @property
+    def present_cells(self) -> Cells:
+        """Cells that are sheet, shape (n,); others may have any shape."""
+        return Cells(*(values[self.present] for values in self.cells))
+
+    def side_lengths(self) -> tuple[Array, Array]:
+        """Compute the lengths of the sides of cells along columns and along rows [m], NaN of cells without sheet."""
+        down, across = (np.linalg.norm(np.diff(self.position, axis=axis), axis=-1) for axis in (0, 1))
+        if self.mask is not None:
+            # A side belongs to the cells on both sides of it.
+            columns, rows = np.pad(self.present, ((0, 0), (1, 1))), np.pad(self.present, ((1, 1), (0, 0)))
+            down[~(columns[:, :-1] | columns[:, 1:])] = np.nan
+            across[~(rows[:-1] | rows[1:])] = np.nan
+        return down, across
 
     @cached_property
     def areas(self) -> Array:
@@ -240,7 +251,7 @@ class CurvedRest(Rest):
     def isotropy_errors(self) -> Array:
         """Isotropy error of each cell, 0 without sheet, shape (rows - 1, cols - 1)."""
         errors = np.zeros(self.present.shape)
-        errors[self.present] = isotropy_errors(Cells(*(values[self.present] for values in self.cells)))
+        errors[self.present] = isotropy_errors(self.present_cells)
         return errors
 
     @cached_property

@@ -1,4 +1,4 @@
-"""The outline of a sheet: cells and mass points that a mask leaves, and the parts that hang together."""
+"""Cells and mass points of a masked sheet, and its connected parts."""
 
 from __future__ import annotations
 
@@ -62,10 +62,6 @@ class Mask:
 
         outside = np.pad(~self.cells, 1, constant_values=True)
         return int(self.parts.max()), label(outside, np.ones((3, 3)))[1] - 1, any(self.pinched_points())
-
-    def points_of(self, part: int) -> NDArray[np.bool_]:
-        """Return whether each mass point belongs to a part."""
-        return sum_around_points(self.parts == part) > 0
 
     def parts_with(self, points: NDArray[np.bool_]) -> set[int]:
         """Return the parts with any of the mass points, a mask of shape (rows, cols)."""

@@ -51,20 +51,24 @@ def place_problems(scene: Scene, rest: Rest) -> Iterator[Problem]:
     for index, probe in enumerate(scene.probes):
         if not probe.moved and (place := _place_without_sheet(probe, rest, scene.time.duration)):
             moves = isinstance(probe.at[0], tuple)
-            remedy = "two keyframes at one time jump over a hole" if moves else "move the tool onto the sheet"
+            remedy = "move the tool onto the sheet" + (", over holes by two keyframes at one time" if moves else "")
             yield Problem(("probes", index, "at"), f"{place} is on no sheet, see sheet.mask; {remedy}")
 
 
 def _place_without_sheet(probe: Probe, rest: Rest, duration: float) -> str:
     """Describe the first place and time at which a force-controlled tool is on no sheet; empty if there is none."""
     keys = np.array(probe.at if isinstance(probe.at[0], tuple) else ((0.0, *probe.at),), dtype=float)
-    # The tool stays where its last keyframe is.
-    keys = np.concatenate([keys, [[max(keys[-1, 0], duration) + 1, *keys[-1, 1:]]]])
+    # The tool is at the first keyframe before it, and at the last one after it.
+    before, after = min(keys[0, 0], 0) - 1, max(keys[-1, 0], duration) + 1
+    keys = np.concatenate([[[before, *keys[0, 1:]]], keys, [[after, *keys[-1, 1:]]]])
     for (begin, *first), (end, *last) in pairwise(keys.tolist()):
-        start, offset = np.array(first), np.array(last) - first
-        share = min(1.0, (duration - begin) / (end - begin)) if end > begin else -1.0
-        if share >= 0 and (gap := rest.first_gap(start, start + share * offset)) is not None:
-            across, down = start + gap * share * offset
-            time = f" at {begin + gap * share * (end - begin):.3g} s" if len(keys) > 2 else ""
+        start, stop = max(begin, 0.0), min(end, duration)
+        if end <= start or begin > duration:  # outside the scene, or a jump
+            continue
+        velocity = np.subtract(last, first) / (end - begin)
+        origin, offset = np.array(first) + (start - begin) * velocity, (stop - start) * velocity
+        if (gap := rest.first_gap(origin, origin + offset)) is not None:
+            across, down = origin + gap * offset
+            time = f" at {start + gap * (stop - start):.3g} s" if len(keys) > 3 else ""
             return f"[{across:.3g}, {down:.3g}]{time}"
     return ""

@@ -18,7 +18,7 @@ from taichi_msm.model.grids import kept_grid
 from taichi_msm.model.mask import Mask, sample_nearest
 from taichi_msm.model.pictured import Picture, PicturedRest
 from taichi_msm.scene.sheet import Sheet, SheetMask
-from taichi_msm.scene.surface import Dome, HeightField, PointGrid, RestSurface, Tube
+from taichi_msm.scene.surface import Dome, HeightField, KeptGrid, PointGrid, RestSurface, Tube
 from taichi_msm.surfaces.surface import point_surface, positions
 
 
@@ -39,6 +39,20 @@ def heights(displacement: NDArray[Any], sheet: Sheet) -> NDArray[Any]:
     """Return the components of displacements, shape (rows, cols, 3), along the normals at rest [m]."""
     rest = rest_of(sheet)
     return (displacement * rest.point_normals).sum(axis=-1) if isinstance(rest, CurvedRest) else displacement[..., 2]
+
+
+def freeze_surface(sheet: Sheet) -> Sheet:
+    """Return a sheet with the smoothing and the even grid that its mass points have, in place of their choice.
+
+    The sheet read again from run.json and rest.npz is then the same, also if its mass points were chosen for a
+    tolerance, while smoothing and grid follow from those of the scene.
+    """
+    if sheet.surface is None or sheet.surface.frame is None:
+        return sheet
+    rest = rest_of(sheet)
+    assert isinstance(rest, CurvedRest)
+    smooth = None if sheet.surface.frame.points == sheet.points else rest.origin.deviation
+    return sheet.with_frozen_surface(smooth, None if rest.origin.grid is None else KeptGrid.of(rest.origin.grid))
 
 
 @lru_cache(maxsize=8)
@@ -65,7 +79,7 @@ def _rest(
         assert frame is not None
         values, sha256_of_file = surface.points.points.values, surface.points.points.sha256
         on_file = point_surface(values)
-        grid = kept_grid(on_file, frame.points, points, (sha256_of_file, surface.points.unit))
+        grid = kept_grid(on_file, frame, points, (sha256_of_file, surface.points.unit))
         position, origin = positions(on_file, grid), Origin(grid)
     else:
         position = KINDS[surface.kind](getattr(surface, surface.kind), FlatRest(points, size).position)

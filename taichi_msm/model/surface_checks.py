@@ -15,11 +15,15 @@ from taichi_msm.model.geometry import CurvedRest
 from taichi_msm.model.rest import rest_of
 from taichi_msm.scene.scene import Scene
 from taichi_msm.scene.section import MAX_POINTS
+from taichi_msm.scene.surface import RestSurface
 
 # Tissue is refused if more than this share of its area has an isotropy error above MAX_ISOTROPY_ERROR.
 MAX_COARSE_SHARE, MAX_ISOTROPY_ERROR = 0.1, 0.5
 
 FOLD_REMEDY = "take more sheet.points, or a smoother surface"
+
+# Aspect of cells from which square ones are advised.
+MAX_ASPECT = 1.5
 
 # Smallest sine of the angle between the sides of a cell.
 MIN_SINE = 1e-6
@@ -37,7 +41,7 @@ def surface_problems(scene: Scene) -> Iterator[Problem]:
         yield Problem(("sheet", "surface", *surface.file_key), str(error))
         return
     assert isinstance(rest, CurvedRest)
-    if (fault := _fold(rest, scene)) or (scene.tissue is not None and (fault := _anisotropy(rest, surface.kind))):
+    if (fault := _fold(rest, scene)) or (scene.tissue is not None and (fault := _anisotropy(rest, surface))):
         yield Problem(key, fault)
     if scene.tissue is not None and scene.tissue.bending:
         text = "needs a flat sheet; with sheet.surface take pretension or foundation instead, which also limit folds"
@@ -63,27 +67,45 @@ def describe_fold(angles: Array) -> str:
     return f"the cell at {describe_largest(angles)} and the next one meet at {angles.max():.0f} degrees"
 
 
-def _anisotropy(rest: CurvedRest, kind: str) -> str:
-    errors, area = rest.isotropy_errors[rest.present], rest.cells.area[rest.present]
+def _anisotropy(rest: CurvedRest, surface: RestSurface) -> str:
+    errors, area = rest.isotropy_errors[rest.present], rest.present_cells.area
     share = float(area[errors > MAX_ISOTROPY_ERROR].sum() / area.sum())
     if share <= MAX_COARSE_SHARE:
         return ""
     return (
         f"{share:.0%} of the area is in cells with an isotropy error above {MAX_ISOTROPY_ERROR:g}, up to "
-        f"{errors.max():.3g} at {describe_largest(rest.isotropy_errors)}; {isotropy_remedy(rest, kind)}"
+        f"{errors.max():.3g} at {describe_largest(rest.isotropy_errors)}; {isotropy_remedy(rest, surface)}"
     )
 
 
-def isotropy_remedy(rest: CurvedRest, kind: str) -> str:
+def aspect(rest: CurvedRest) -> float:
+    """Return the aspect of cells, on an even grid r, at which the mean of E / (r A) + G r / A over corners is least."""
+    if rest.origin.grid is None:
+        return rest.cell_sides[0] / rest.cell_sides[1]
+    across, down = np.diff(rest.position, axis=1), np.diff(rest.position, axis=0)
+    totals = np.zeros(2)
+    for a in (across[:-1], across[1:]):
+        for b in (down[:, :-1], down[:, 1:]):
+            area = np.linalg.norm(np.cross(a, b), axis=-1)
+            totals += ((a * a).sum(axis=-1) / area).sum(), ((b * b).sum(axis=-1) / area).sum()
+    return float(np.sqrt(totals[0] / totals[1]))
+
+
+def square_points(rest: CurvedRest) -> tuple[int, int]:
+    """Return the numbers of rows and columns with nearly square cells, at least those of the sheet."""
+    r, (rows, cols) = aspect(rest), rest.position.shape[:2]
+    return (rows, round((cols - 1) * r) + 1) if r > 1 else (round((rows - 1) / r) + 1, cols)
+
+
+def isotropy_remedy(rest: CurvedRest, surface: RestSurface) -> str:
     """Return the numbers of points with nearly square cells, or the advice for sheared and uneven cells."""
-    (p, q), (rows, cols) = rest.cell_sides, (count - 1 for count in rest.position.shape[:2])
+    square, r = square_points(rest), aspect(rest)
     # Rhombi of 60 to 120 degrees are isotropic.
-    if np.median(np.abs(rest.cells.cosine[rest.present])) <= 0.5 and max(p / q, q / p) >= 1.5:
-        finer = (rows, round(cols * p / q)) if p > q else (round(rows * q / p), cols)
-        if max(finer) < MAX_POINTS:
-            return f"try sheet.points: {[count + 1 for count in finer]}, with nearly square cells"
-    if kind == "points":
-        return "give points at even distances along lines that cross at right angles"
+    is_oblique = np.median(np.abs(rest.present_cells.cosine)) > 0.5
+    if max(r, 1 / r) >= MAX_ASPECT and not is_oblique and max(square) <= MAX_POINTS:
+        return f"try sheet.points: {list(square)}, with nearly square cells"
+    if surface.has_own_size and not surface.is_even:
+        return "take sheet.surface.grid: even"
     return "take a less steep surface, on which cells are sheared and stretched less"
 
 

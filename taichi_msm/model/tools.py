@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 
 from taichi_msm.arithmetic import NUMPY, Array
 from taichi_msm.errors import Problem
-from taichi_msm.model.geometry import Rest
+from taichi_msm.model.geometry import CurvedRest
 from taichi_msm.model.rest import rest_of
 from taichi_msm.model.sheet import SIDES, fixed_points, fixed_sides, rest_positions
 from taichi_msm.model.time_grid import TimeGrid
@@ -282,7 +282,7 @@ class SolidTool(Tool):
 class FollowingTool(SolidTool):
     """A tool over a curved sheet, whose path follows the surface at rest."""
 
-    rest: Rest
+    rest: CurvedRest
     places: Array  # across and down at the keyframes, shape (n, 2)
 
     def path_at(self, t: Array) -> Array:
@@ -304,13 +304,12 @@ class FollowingTool(SolidTool):
         return x, y, z
 
     def point_spacing(self, sheet: Sheet) -> float:  # noqa: ARG002
-        places = _interpolate(self.bends, self.times, self.places)
-        position, count = self.rest.position, np.array(self.rest.position.shape[1::-1]) - 1
+        places = self.rest.mesh_places(_interpolate(self.bends, self.times, self.places))
+        (down, across), count = self.rest.side_lengths(), np.array(self.rest.position.shape[1::-1]) - 1
         # The cells under the path, and those next to them.
         first, last = (np.clip(np.floor(places * count).astype(int) + n, 0, count) for n in (-1, 2))
-        windows = (position[i:k, j:m] for (j, i), (m, k) in zip(first, last + 1, strict=True))
-        sides = (np.linalg.norm(np.diff(window, axis=n), axis=-1) for window in windows for n in (0, 1))
-        return max(float(each.max(initial=0.0)) for each in sides)
+        windows = ((down[i:k, j : m + 1], across[i : k + 1, j:m]) for (j, i), (m, k) in zip(first, last, strict=True))
+        return max(float(np.nan_to_num(each).max(initial=0.0)) for window in windows for each in window)
 
     def direction_at(self, t: float) -> Array:
         return self._follow(np.array([t]))[1][0]
@@ -408,11 +407,11 @@ def build_tools(probes: Sequence[Probe], sheet: Sheet) -> tuple[Tool, ...]:
         friction = math.inf if probe.friction == "rough" else probe.friction
         stride = min(shape.max_stride, ROUGH_STRIDE_RADII if friction == math.inf else 1) * radius
         numbers = index, time, path, stride, probe.grip, heights, axis, instrument.length, radius, shape, friction
-        if rest.is_flat:
-            tools.append(SolidTool(*numbers))
-        else:
+        if isinstance(rest, CurvedRest):
             following = FollowingTool(*numbers, rest, places)
             tools.append(replace(following, path=following.path_at(time)))
+        else:
+            tools.append(SolidTool(*numbers))
     return tuple(tools)
 
 

@@ -162,8 +162,6 @@ def _reference_light(scene: Scene, texture: NDArray[np.uint8], config: DrawingCo
         rows, columns = distance_transform_edt(is_missing, return_distances=False, return_indices=True)
         return (light[rows, columns],)
 
-    hashes = [
-        sha256(array.tobytes()).digest() for array in (rest.position, rest.present, texture, view.matrix)
-    ]
+    hashes = [sha256(array.tobytes()).digest() for array in (rest.position, rest.present, texture, view.matrix)]
     key = "light", *hashes, texture.shape, config, render.refine, render.light, view.optics, view.distance
     return cached_arrays(key, draw)[0]

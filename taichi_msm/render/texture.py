@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from taichi_msm.errors import ArgumentError, Problem, SceneError, as_array
 from taichi_msm.images import MAX_SIDE_PX, PictureError, file_sha256, has_transparency, picture_size, read_rgb
+from taichi_msm.scene.framing import region_fault
 from taichi_msm.scene.scene import Scene
 from taichi_msm.system.array_cache import cached_arrays
 
@@ -72,22 +73,21 @@ def is_see_through(scene: Scene) -> bool:
 
 def image_problems(scene: Scene) -> Iterator[Problem]:
     """Yield the problems of the scene's picture and region; only the header of the file is read."""
-    size = None
     if scene.image is not None:
-        try:
-            size = picture_size(scene.image)
-        except PictureError as error:
-            yield Problem(("image",), str(error))
+        yield from picture_problems(scene.image)
     if scene.region is not None:
-        yield from _region_problems(scene.region, size)
+        yield from _region_problems(scene.region, image_size(scene))
+
+
+def picture_problems(image: Any) -> Iterator[Problem]:
+    """Yield the problem of the path of a picture; that of another type is one of its key."""
+    try:
+        if isinstance(image, str):
+            picture_size(image)
+    except PictureError as error:
+        yield Problem(("image",), str(error))
 
 
 def _region_problems(region: tuple[int, int, int, int], size: tuple[int, int] | None) -> Iterator[Problem]:
-    x, y, width, height = region
-    if x < 0 or y < 0 or width < 1 or height < 1:
-        yield Problem(("region",), f"{list(region)} needs x and y of 0 or more, width and height above 0")
-    elif size is not None and (x + width > size[0] or y + height > size[1]):
-        yield Problem(
-            ("region",),
-            f"{list(region)} ends at {x + width}, {y + height}; the image has {size[0]} x {size[1]} pixels",
-        )
+    if fault := region_fault(region, size):
+        yield Problem(("region",), fault)

@@ -2,7 +2,8 @@
 
 A checkpoint is a folder with two files:
 
-- `state.npz`: the manifest, with all inputs that determine the results, and the last saved state of the solver;
+- `state.npz`: the manifest, with all inputs that determine the results, the even grid of a surface, and the last saved
+  state of the solver;
 - `frames`: positions and forces of every frame.
 
 Readers verify the CRC-32 of each part, and validate its contents, because the folder may be untrusted.
@@ -30,13 +31,15 @@ from pydantic import TypeAdapter
 from taichi_msm.accuracy.mesh import MeshEstimate
 from taichi_msm.accuracy.time_step import TimeStepEstimate
 from taichi_msm.errors import DamagedError, FilesError, ForeignError, SceneError, writing
-from taichi_msm.images import PictureError, file_sha256
+from taichi_msm.images import PictureError, file_sha256, use_folder
 from taichi_msm.model.plan import Plan
 from taichi_msm.model.time_grid import DTYPES
 from taichi_msm.render.camera import camera_problems
 from taichi_msm.runs.arrays import read_array, read_rows, write_arrays
 from taichi_msm.runs.directory import FILE, FOLDER, STAGING_FOLDER, create_file, require_kind
 from taichi_msm.scene.scene import Scene
+from taichi_msm.scene.sheet import Sheet
+from taichi_msm.scene.surface import KeptGrid
 from taichi_msm.solver.planning import try_plan
 from taichi_msm.solver.state import PeakForce, ProbeForces, RunProgress, Snapshot, State, TipForce
 from taichi_msm.system.compiler import result_versions
@@ -120,9 +123,12 @@ def read_manifest(directory: Path) -> tuple[Manifest, Plan]:
         raise FilesError(f"{path}: {(error.strerror or str(error)).lower()}") from None
     try:
         with file, zipfile.ZipFile(file) as archive:
-            manifest = _MANIFEST_ADAPTER.validate_python(json.loads(_manifest_bytes(archive)))
-        # The current directory may differ from that of the original process.
-        manifest = replace(manifest, scene=manifest.scene.with_pictures(partial(os.path.join, manifest.folder)))
+            data = json.loads(_manifest_bytes(archive))
+            # The current directory may differ from that of the original process.
+            with use_folder(data["folder"]):
+                manifest = _MANIFEST_ADAPTER.validate_python(data)
+            scene = manifest.scene.with_pictures(partial(os.path.join, manifest.folder))
+            manifest = replace(manifest, scene=scene.model_copy(update={"sheet": _frozen_sheet(scene.sheet, archive)}))
     except Exception:  # a forged archive may raise any type
         if path.with_name("manifest.json").exists():
             problem = "is of an earlier version of the program"
@@ -141,6 +147,16 @@ def read_manifest(directory: Path) -> tuple[Manifest, Plan]:
     if plan is None or problems or not is_valid or list(camera_problems(manifest.scene)):
         raise DamagedError(f"{path} is damaged: its scene is invalid; run the scene again")
     return manifest, plan
+
+
+def _frozen_sheet(sheet: Sheet, archive: zipfile.ZipFile) -> Sheet:
+    """Return the sheet with the even grid of a checkpoint, if it has one."""
+    grid = None
+    if sheet.surface and sheet.surface.is_even:
+        grid = read_array(archive, "grid", np.dtype(np.float64), (*sheet.points, 2))
+        if not np.isfinite(grid).all():
+            raise ValueError("grid")
+    return sheet.with_frozen_surface(None, None if grid is None else KeptGrid.of(grid))
 
 
 def is_unfinished(directory: Path) -> bool:
@@ -195,6 +211,8 @@ class Checkpoint:
         self.precision = DTYPES[plan.grid.precision]  # of the positions
         self._plan, self._state_path, self._frames_path = plan, folder / STATE_FILE, folder / FRAMES_FILE
         self._next_save, self._manifest = 0.0, b""
+        grid = scene.sheet.surface.frame.grid if scene.sheet.surface and scene.sheet.surface.frame else None
+        self._grid = {} if grid is None else {"grid": grid.fractions}
         self._directory = folder.parent.parent  # of the results, for messages
         self._file: BinaryIO | None = None  # None without outputs: the frames are not needed
         position = "position", self.precision, (*scene.sheet.points, 3)
@@ -278,7 +296,7 @@ class Checkpoint:
         try:
             with self._state_path.open("rb") as file, zipfile.ZipFile(file) as archive:
                 self._manifest = _manifest_bytes(archive)
-                if len(archive.namelist()) == 1:  # only the manifest
+                if len(archive.namelist()) == 1 + len(self._grid):  # without a state
                     return None
                 arrays = {name: read_array(archive, name, array.dtype, array.shape) for name, array in expected.items()}
         except FileNotFoundError:
@@ -313,7 +331,7 @@ class Checkpoint:
         draft = self._state_path.with_suffix(".new")
         draft.unlink(missing_ok=True)
         with create_file(draft) as file:
-            write_arrays(file, {"manifest": np.frombuffer(self._manifest, np.uint8), **arrays})
+            write_arrays(file, {"manifest": np.frombuffer(self._manifest, np.uint8), **self._grid, **arrays})
         draft.replace(self._state_path)
 
     def _read(self, frame: int) -> tuple[NDArray[Any], NDArray[np.float64]]:

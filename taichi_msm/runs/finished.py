@@ -6,7 +6,7 @@ import errno
 import json
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, suppress
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -15,15 +15,17 @@ from numpy.typing import NDArray
 from pydantic import TypeAdapter
 
 from taichi_msm.errors import FilesError, SceneError, require_path
-from taichi_msm.images import PictureError, file_sha256, read_rgb
+from taichi_msm.images import PictureError, file_sha256, read_rgb, use_folder
 from taichi_msm.model.geometry import Rest
 from taichi_msm.model.rest import rest_of
 from taichi_msm.model.sheet import rest_positions
 from taichi_msm.render.camera import camera_problems
 from taichi_msm.runs.arrays import map_array
 from taichi_msm.runs.directory import FILE, FOLDER, MAX_RECORD_BYTES, entry_kind
-from taichi_msm.scene.outputs import OUTPUTS, RUN_RECORD, SWEEP_RECORD
+from taichi_msm.scene.outputs import OUTPUTS, REST_FILE, RUN_RECORD, SWEEP_RECORD
 from taichi_msm.scene.scene import Scene
+from taichi_msm.scene.sheet import Sheet
+from taichi_msm.scene.surface import KeptGrid
 from taichi_msm.solver.planning import try_plan
 from taichi_msm.system.files import read_regular
 
@@ -106,6 +108,20 @@ class FinishedRun:
                 fault = error.fault
             raise FilesError(f"{self.directory}: {key}: {fault}; {RESTORE_PICTURE}")
 
+    def _frozen_sheet(self) -> Sheet:
+        """Return the sheet with the even grid in rest.npz, if it has one."""
+        sheet, path = self.scene.sheet, self.directory / REST_FILE
+        if not (sheet.surface and sheet.surface.is_even):
+            return sheet.with_frozen_surface(None, None)
+        with reading(path):
+            if entry_kind(path) != FILE:
+                fault = entry_kind(path) or "no such file"
+                raise FilesError(f"{path}: {fault}; restore it, or run the scene again")
+            grid = np.array(map_array(path, "grid", np.float64, (*sheet.points, 2)))
+        if not np.isfinite(grid).all():
+            raise damaged_result(path)
+        return sheet.with_frozen_surface(None, KeptGrid.of(grid))
+
     def rest(self) -> Rest | None:
         """Return the sheet at rest with its mask and its picture by a camera, None without both.
 
@@ -183,7 +199,8 @@ def read_run(directory: str | Path) -> FinishedRun:
             path.parent, record["status"], scene, frames, largest_frame, sha256, overrides, data, scene.render.main
         )
         run._require_same(scene.sheet.files)  # without which there is no sheet
-        problems = [*try_plan(scene)[1], *camera_problems(scene)]
+        run = replace(run, scene=scene.model_copy(update={"sheet": run._frozen_sheet()}))
+        problems = [*try_plan(run.scene)[1], *camera_problems(run.scene)]
         # Other problems are ignored: later methods check the pictures, and the step was valid with the original map.
         if any(problem.path[-1:] != ("image",) and problem.path[0] != "time" for problem in problems):
             raise SceneError([str(problem) for problem in problems])
@@ -211,7 +228,9 @@ def damaged_result(path: Path) -> FilesError:
 
 def _read_scene(record: Mapping[str, Any]) -> Scene:
     """Build the scene of a record, with picture paths relative to the current directory."""
-    scene, folder = Scene(**record["scene"]), Path(record["working_directory"])
+    folder = Path(record["working_directory"])
+    with use_folder(folder):
+        scene = Scene(**record["scene"])
     if folder != Path.cwd():
         scene = scene.with_pictures(lambda path: str(folder / path))
     return scene

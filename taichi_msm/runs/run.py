@@ -409,8 +409,10 @@ class _Run:
             *(self._path_dependence.warnings() if self._path_dependence else ()),
             *drawing_warnings(scene),
         ]
-        # Picture paths are as given; only the sections sheet and time contain resolved values.
-        simulated = manifest.given.model_copy(update={"sheet": scene.sheet, "time": scene.time})
+        # Paths are as given; only the sections sheet and time contain resolved values.
+        given_paths = dict(zip(scene.sheet.files.values(), manifest.given.sheet.files.values(), strict=True))
+        sheet = scene.sheet.with_files(given_paths.__getitem__)
+        simulated = manifest.given.model_copy(update={"sheet": sheet, "time": scene.time})
         return {
             "scene": simulated.model_dump(mode="json"),
             "asked": _requested_values(manifest.given, scene),
@@ -467,7 +469,9 @@ def free_cores(plan: Plan) -> int:
 
 def _requested_values(given: Scene, scene: Scene) -> dict[str, Any]:
     """Return the requested values that differ from the resolved ones, by dotted key."""
-    keys = ("sheet.points", "sheet.tolerance", "time.step", "time.precision", "time.tolerance")
+    keys = ["sheet.points", "sheet.tolerance", "time.step", "time.precision", "time.tolerance"]
+    if given.sheet.surface and given.sheet.surface.depth:
+        keys.append("sheet.surface.depth.smooth")
     values = zip(keys, attrgetter(*keys)(given), attrgetter(*keys)(scene), strict=True)
     return {key: requested for key, requested, resolved in values if requested != resolved}
 

@@ -20,6 +20,7 @@ from taichi_msm.accuracy.surface import SurfaceRecord
 from taichi_msm.cameras.view import pair_transform
 from taichi_msm.errors import writing
 from taichi_msm.model.geometry import CurvedRest
+from taichi_msm.model.pictured import PicturedRest
 from taichi_msm.model.plan import Plan
 from taichi_msm.model.rest import rest_of
 from taichi_msm.model.surface import surface_positions
@@ -153,11 +154,16 @@ class ResultWriter(AbstractContextManager["ResultWriter"]):
             write_arrays(file, arrays)
 
     def _write_rest(self) -> None:
-        """Write positions [m], areas [m2] and normals of the mass points at rest."""
+        """Write positions [m], areas [m2] and normals of the mass points at rest, and their places in the picture."""
         rest = rest_of(self._scene.sheet)
         assert isinstance(rest, CurvedRest)
+        arrays = {"position": rest.position, "area": rest.areas, "normal": rest.point_normals}
+        if isinstance(rest, PicturedRest):
+            arrays["texture"] = rest.texture
+        if rest.origin.grid is not None:
+            arrays["grid"] = rest.origin.grid
         with create_file(self._publication.new_folder / outputs.REST_FILE) as file:
-            write_arrays(file, {"position": rest.position, "area": rest.areas, "normal": rest.point_normals})
+            write_arrays(file, arrays)
 
     def _write_forces(self) -> None:
         """Write the forces of all frames, as decimals that round-trip to float64."""

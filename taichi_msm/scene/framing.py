@@ -25,10 +25,16 @@ PICTURE = "picture"
 MAIN = "main"
 
 
+def is_framed(data: Mapping[str, Any]) -> bool:
+    """Return whether the surface of a scene, maybe invalid, has a picture by a camera."""
+    surface = _get(data, "sheet", "surface")
+    return _get(surface, "depth") is not None or _get(surface, "picture") is not None
+
+
 def framed_image_size(data: Mapping[str, Any]) -> tuple[int, int] | None:
     """Return the size of the image of a scene, maybe invalid, whose surface has a picture by a camera [px]."""
-    surface, image = _get(data, "sheet", "surface"), data.get("image")
-    if not isinstance(image, str) or (_get(surface, "depth") is None and _get(surface, "picture") is None):
+    image = data.get("image")
+    if not isinstance(image, str) or not is_framed(data):
         return None
     try:
         return picture_size(image)
@@ -36,22 +42,24 @@ def framed_image_size(data: Mapping[str, Any]) -> tuple[int, int] | None:
         return None  # It is reported with the image.
 
 
-def complete_framed(data: Mapping[str, Any], size: tuple[int, int]) -> Mapping[str, Any]:
-    """Add to the sections of a scene the size and light of its pictures, and the pose of the camera of a depth map."""
+def complete_framed(data: Mapping[str, Any], size: tuple[int, int] | None) -> Mapping[str, Any]:
+    """Add to a scene the size of its image, if it is known, the light, and the pose of a depth map's camera."""
     render, depth = data.get("render", {}), _get(data, "sheet", "surface", "depth")
     if not isinstance(render, Mapping):
         return data
-    render = {"size": size, **render}
+    if size is not None:
+        render = {"size": size, **render}
     if isinstance(light := render.get("light", {}), Mapping):
-        render["light"] = {**MATTE, **light}
+        render = {**render, "light": {**MATTE, **light}}
     cameras = render.get("cameras")
     if depth is not None and isinstance(render.get("camera"), Mapping):
-        render["camera"] = _at_origin(render["camera"])
+        render = {**render, "camera": _at_origin(render["camera"])}
     if depth is not None and isinstance(cameras, Mapping) and cameras:
-        name = _get(depth, "camera") or next(iter(cameras))
-        if isinstance(cameras.get(name), Mapping):
-            render["cameras"] = {**cameras, name: _at_origin(cameras[name])}
-    return {**data, "render": render}
+        name = _get(depth, "camera")
+        name = name if isinstance(name, str) and name in cameras else next(iter(cameras))
+        if isinstance(cameras[name], Mapping):
+            render = {**render, "cameras": {**cameras, name: _at_origin(cameras[name])}}
+    return {**data, "render": render} if render else data
 
 
 def _at_origin(camera: Mapping[str, Any]) -> Mapping[str, Any]:
@@ -85,10 +93,13 @@ def frame_sheet(
         return sheet if frame == surface.frame else sheet.model_copy(update={"surface": surface.with_frame(frame)})
     name = surface.depth.camera if surface.depth else surface.picture
     key = ("sheet", "surface", *surface.frame_key)
+    if image is None:
+        kind = "depth" if surface.depth else "picture"
+        raise scene_fault(f"sheet.surface.{kind} needs the picture that the camera took; name it", "image")
     if size is None:
-        if image is None:
-            raise scene_fault("needs image, the picture that the camera took", *key[:-1])
         return sheet  # The file of the image is reported.
+    if region is not None and (fault := region_fault(region, size)):
+        raise scene_fault(fault, "region")
     (width, height), (image_width, image_height) = render.size, size
     if width * image_height != height * image_width:
         text = f"{width} x {height} has another aspect than the image, {image_width} x {image_height}"
@@ -117,6 +128,16 @@ def keep_picture_camera(sheet: Sheet, before: Render, after: Render) -> tuple[Sh
         surface = surface.model_copy(update={"picture": PICTURE})
     render = {name: value for name, value in after if name in after.model_fields_set - {"camera"}}
     return sheet.model_copy(update={"surface": surface}), Render(**{**render, "cameras": cameras})
+
+
+def region_fault(region: tuple[int, int, int, int], size: tuple[int, int] | None) -> str:
+    """Return the fault of a region of a picture of a width and height [px], None for an unknown one; empty without."""
+    x, y, width, height = region
+    if x < 0 or y < 0 or width < 1 or height < 1:
+        return f"{list(region)} needs x and y of 0 or more, width and height above 0"
+    if size is not None and (x + width > size[0] or y + height > size[1]):
+        return f"{list(region)} ends at {x + width}, {y + height}; the image has {size[0]} x {size[1]} pixels"
+    return ""
 
 
 def _chain(render: Render, name: str | None, key: tuple[str, ...]) -> tuple[Camera, ...]:

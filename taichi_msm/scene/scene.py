@@ -8,7 +8,7 @@ from typing import Annotated, Any, Literal
 from pydantic import ConfigDict, Field, ModelWrapValidatorHandler, model_validator
 
 from taichi_msm.integrators import INTEGRATORS, Integrator
-from taichi_msm.scene.framing import complete_framed, frame_sheet, framed_image_size
+from taichi_msm.scene.framing import complete_framed, frame_sheet, framed_image_size, is_framed
 from taichi_msm.scene.outputs import ENTRIES, OUTPUTS
 from taichi_msm.scene.render import Render, calibrated_size
 from taichi_msm.scene.section import (
@@ -222,7 +222,7 @@ class Scene(Section):
         """Let cameras refer to the size of an image that one of them took, and give the surface its `Frame`."""
         size = framed_image_size(data) if isinstance(data, Mapping) else None
         with calibrated_size(size):
-            scene = handler(data if size is None else complete_framed(data, size))
+            scene = handler(complete_framed(data, size) if isinstance(data, Mapping) and is_framed(data) else data)
         # The scene is frozen.
         scene.__dict__["sheet"] = frame_sheet(scene.sheet, scene.render, scene.image, size, scene.region)
         return scene

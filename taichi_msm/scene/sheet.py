@@ -29,7 +29,7 @@ from taichi_msm.scene.section import (
     key,
     scene_fault,
 )
-from taichi_msm.scene.surface import PointGrid, RestSurface
+from taichi_msm.scene.surface import KeptGrid, PointGrid, RestSurface
 
 if TYPE_CHECKING:
     import numpy as np
@@ -206,6 +206,21 @@ class Sheet(Section):
             return self
         frame = self.surface.frame._replace(is_kept=True)
         return self.model_copy(update={"surface": self.surface.with_frame(frame)})
+
+    def with_frozen_surface(self, smooth: float | None, grid: KeptGrid | None) -> Sheet:
+        """Return a copy whose surface of a file follows from its own mass points, as a run has used it.
+
+        Args:
+            smooth: standard deviation in place of that of a depth map [px]; None for no change.
+            grid: even grid, of as many mass points as the sheet's; None to minimise it, or for a grid as in the file.
+        """
+        surface = self.surface
+        if surface is None or surface.frame is None:
+            return self
+        frame = surface.frame._replace(points=self.points, is_kept=True, grid=grid)
+        if surface.depth and smooth is not None:
+            surface = surface.model_copy(update={"depth": surface.depth.model_copy(update={"smooth": smooth})})
+        return self.model_copy(update={"surface": surface.with_frame(frame)})
 
     @property
     def unit_hint(self) -> str:

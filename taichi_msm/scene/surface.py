@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import hashlib
 from collections.abc import Callable, Collection
+from dataclasses import dataclass, field
 from functools import cached_property
-from typing import TYPE_CHECKING, Annotated, Literal, NamedTuple
+from typing import TYPE_CHECKING, Annotated, Any, Literal, NamedTuple
 
 from pydantic import AfterValidator, ConfigDict, Field, PrivateAttr, model_validator
 from typing_extensions import Self
@@ -15,7 +17,7 @@ from taichi_msm.scene.camera import Camera
 from taichi_msm.scene.section import FilePath, NotNegative, Number, Positive, Section, key, scene_fault
 
 if TYPE_CHECKING:
-    pass
+    from numpy.typing import NDArray
 
 METRES = {"m": 1.0, "mm": 1e-3, "um": 1e-6}
 
@@ -144,7 +146,7 @@ class DepthMap(Section):
                 "(h, w) or (h, w, 3)",
             )
             values = values[..., 2] if values.ndim == 3 else values
-        return ArrayFile(values, sha256, self.metres * quantum(values))
+        return ArrayFile(values, sha256, 0.0)
 
     @property
     def metres(self) -> float:
@@ -175,6 +177,19 @@ class PointGrid(Section):
         )
 
 
+@dataclass(frozen=True)
+class KeptGrid:
+    """Even grid of a run, compared by its digest."""
+
+    fractions: NDArray[Any] = field(compare=False)  # across and down, shape (rows, cols, 2)
+    sha256: str
+
+    @classmethod
+    def of(cls, fractions: NDArray[Any]) -> KeptGrid:
+        """Return the grid of fractions across and down, shape (rows, cols, 2)."""
+        return cls(fractions, hashlib.sha256(fractions.tobytes()).hexdigest())
+
+
 class Frame(NamedTuple):
     """The picture on a surface that a camera sees at the start, and that camera."""
 
@@ -183,6 +198,7 @@ class Frame(NamedTuple):
     region: tuple[int, int, int, int]  # x, y, width and height of the part on the sheet [px]
     points: tuple[int, int]  # rows and columns from which smoothing and grid follow
     is_kept: bool = False  # whether the surface keeps this frame, also with other cameras or mass points
+    grid: KeptGrid | None = None  # of `points`, of a run that is repeated or continued; None: by minimisation
 
 
 KINDS = ("height", "tube", "dome", "depth", "points")
@@ -283,7 +299,8 @@ class RestSurface(Section):
         section = self._file_section
         if section is None:
             return self
-        return self.model_copy(update={self.kind: section.model_copy(update={"file": path(section.file)})})
+        changed = self.model_copy(update={self.kind: section.model_copy(update={"file": path(section.file)})})
+        return changed.with_frame(self.frame)
 
     @model_validator(mode="after")
     def _check_one_kind(self) -> Self:

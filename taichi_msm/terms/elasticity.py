@@ -75,6 +75,7 @@ def spring_families(plan: Plan) -> Iterator[SpringFamily]:
     for k, tension, (start, end) in zip(springs.stiffness, springs.tension, spring_ends(sheet.points), strict=True):
         offset = rest[end] - rest[start]
         length = np.sqrt((offset**2).sum(axis=-1))
+        length[length == 0] = 1.0  # of cells without sheet; they have no stiffness
         numbers = law.constants(length) if law else ()
         yield SpringFamily(start, end, offset, length, k - tension, tension, functions, numbers)
 

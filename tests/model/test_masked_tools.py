@@ -203,8 +203,9 @@ def test_largest_pressure_is_on_the_sheet() -> None:
         [0.5, 0.5],
         [[0, 0.1, 0.5], [0.1, 0.9, 0.5]],
         [[0, 0.1, 0.5], [0.05, 0.1, 0.5], [0.05, 0.5, 0.5]],
+        [[0.5, 0.5, 0.5], [0.6, 0.1, 0.5]],
     ],
-    ids=["in the hole", "across the hole", "jump into the hole"],
+    ids=["in the hole", "across the hole", "jump into the hole", "before the first keyframe"],
 )
 def test_a_force_on_no_sheet_is_refused(at: Any, message: Messages) -> None:
     with message.raises(SceneError, "probes.0.at:"):
@@ -216,8 +217,9 @@ def test_a_force_on_no_sheet_is_refused(at: Any, message: Messages) -> None:
     [
         [[0, 0.1, 0.5], [0.05, 0.2, 0.5], [0.05, 0.8, 0.5], [0.1, 0.9, 0.5]],
         [[0, 0.1, 0.5], [0.1, 0.2, 0.5], [0.5, 0.5, 0.5]],
+        [[-1, 0.5, 0.5], [-0.5, 0.1, 0.5]],
     ],
-    ids=["jump over the hole", "hole after the end"],
+    ids=["jump over the hole", "hole after the end", "hole before the start"],
 )
 def test_a_force_that_stays_on_the_sheet(at: Any) -> None:
     assert plan_of(probes=[push(at)]).slots

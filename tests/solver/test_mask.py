@@ -13,12 +13,15 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from taichi_msm import FilesError, resume, run
+from taichi_msm.accuracy.surface import describe_surface
 from taichi_msm.model.geometry import CurvedRest
 from taichi_msm.model.mask import Mask
 from taichi_msm.model.rest import rest_of
 from taichi_msm.model.tool_force import control_point
+from taichi_msm.model.tools import path_warnings
 from taichi_msm.scene.scene import Scene
 from taichi_msm.scene.sheet import Sheet, SheetMask
+from taichi_msm.scene.tools import Probe
 from taichi_msm.solver import dynamics as dynamics_module
 from taichi_msm.solver.arrays import SheetLayout
 from taichi_msm.solver.dynamics import Dynamics
@@ -209,16 +212,21 @@ def test_parts_that_meet_at_a_point() -> None:
 
 @pytest.mark.parametrize("place", [(0.01, 0.0, 0.05), (1.0, 2.0, 3.0)])
 def test_places_of_points_without_sheet_do_not_matter(place: Any, device: Device) -> None:
-    """They make cells without area, or long ones."""
+    """They make cells without area, or long ones, next to the path of a ball."""
     shape = surface.rest_positions({"dome": {"radius": 0.1}}, (14, 15), (0.12, 0.14))
+    ball = Probe(**{**BALL, "path": [[0, 0.39, 0.19, 0.001], [0.1, 0.39, 0.19, -0.004]]})
     results = []
     for absent in (shape, np.array(place)):
         count = cell_counts(present_cells(scene_of("loads").sheet))[..., None]
         np.save("points.npy", np.where(count > 0, shape, absent))
         keys = {"points": POINTS, "surface": {"points": {"file": "points.npy", "unit": "m"}}, "mask": "mask.png"}
         scene = scene_of("dome, tense, locking")
-        scene = scene.model_copy(update={"sheet": Sheet(**keys, fixed=["outline"]), "probes": scene.probes[:1]})
-        results.append((make_plan(scene).stable_step, frames(scene, device).tobytes()))
+        sheet, probes = Sheet(**keys, fixed=["outline"]), (scene.probes[0], ball)
+        scene = scene.model_copy(update={"sheet": sheet, "probes": probes})
+        plan, displacements = make_plan(scene), frames(scene, device)
+        texts = [*describe_surface(plan), *path_warnings(scene, plan.tools)]
+        density = energy_density(plan, displacements[-1])
+        results.append((plan.stable_step, displacements.tobytes(), density.tobytes(), texts))
     assert results[0] == results[1]
 
 

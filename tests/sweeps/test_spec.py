@@ -182,7 +182,7 @@ def test_keys_that_name_files() -> None:
             walk(schema["$defs"][part["$ref"].rpartition("/")[2]], key)
 
     walk(schema, ())
-    assert len(keys) == 12
+    assert len(keys) == 13
     assert all(map(names_file, keys))
 
 

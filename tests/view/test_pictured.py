@@ -24,7 +24,7 @@ WIDTH, HEIGHT = 96, 72
 def test_session(kind: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, device: Device) -> None:
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
-    camera = {"intrinsics": {"fx": 80, "fy": 80, "cx": 47.5, "cy": 35.5}}
+    camera: dict[str, object] = {"intrinsics": {"fx": 80, "fy": 80, "cx": 47.5, "cy": 35.5}}
     x, y = np.meshgrid((np.arange(WIDTH) - 47.5) / 80, (np.arange(HEIGHT) - 35.5) / 80)
     depth = 0.06 / (1 - 0.3 * x + 0.2 * y)
     Image.fromarray(speckle(HEIGHT, WIDTH)).save("image.png")
