@@ -111,13 +111,14 @@ def _view_of(scene: Scene, time: float, name: str) -> View:
 
 
 def picture_view(scene: Scene, texture_size: tuple[int, int]) -> View:
-    """Return the view of the camera of a picture on the sheet, for pixels that are texels; its light is at it."""
+    """Return the view of the camera of a picture on the sheet, for pixels that are texels, lit at the main camera."""
     rest, surface = rest_of(scene.sheet), scene.sheet.surface
     assert isinstance(rest, PicturedRest)
     assert surface is not None
     assert surface.frame is not None
-    distance = _distance(surface.frame.cameras[-1], scene)
-    return rest.picture.view.cropped(rest.picture.region, texture_size)._replace(near=_near(scene), distance=distance)
+    view, distance = rest.picture.view, _distance(surface.frame.cameras[-1], scene)
+    view = view._replace(near=_near(scene), distance=distance, light_view=view_at(scene, 0.0))
+    return view.cropped(rest.picture.region, texture_size)
 
 
 def is_moving(scene: Scene, name: str = "") -> bool:
