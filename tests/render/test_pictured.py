@@ -239,7 +239,7 @@ def test_deformed_sheet_from_another_camera_matches_the_twin(lens: str, shading:
         ratio = np.minimum(twin_light(made, buffer, position, camera) / reference, 4)
         colour = np.minimum(colour * ratio[..., None], 255)
         assert (colour[covered] == 255).any()
-        assert ratio[covered].min() < 0.8
+        assert ratio[covered].min() < 0.9
     difference = np.abs(frame - np.floor(colour + 0.5))[covered].max(axis=-1)
     # The silhouette moves past few pixel centres, as in `assert_picture_matches_twin`.
     assert (difference > 1).mean() < 0.01
@@ -334,7 +334,10 @@ def test_texture_coordinates_of_a_refined_surface() -> None:
         np.testing.assert_allclose(surface.texture_coordinates, pixels / SIZE, rtol=0, atol=1e-9)
 
 
-def test_picture_of_a_camera_that_is_not_the_main_one(device: Device) -> None:
-    made = seen_aside(size=list(SIZE))
+@pytest.mark.default_cases("headlight")
+@pytest.mark.parametrize("shading", ["none", "headlight", "tissue"])
+def test_picture_of_a_camera_that_is_not_the_main_one(shading: str, device: Device) -> None:
+    """The light is at the main camera, of the frame and of the reference."""
+    made = seen_aside(size=list(SIZE), shading=shading)
     frame = draw_at_rest(made, view_at(made, 0.0, "scope"))
     assert np.abs(frame.astype(int) - load_texture(made)).max() <= 1
