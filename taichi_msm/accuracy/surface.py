@@ -11,6 +11,7 @@ from typing_extensions import TypedDict
 from taichi_msm.accuracy.depth import depth_steps
 from taichi_msm.model.cells import cell_stiffness
 from taichi_msm.model.geometry import CurvedRest
+from taichi_msm.model.pictured import PicturedRest
 from taichi_msm.model.plan import Plan
 from taichi_msm.model.rest import rest_of
 from taichi_msm.model.surface_checks import (
@@ -35,6 +36,9 @@ NOTED_FILLED = 0.05
 
 # Extent above which, and rise relative to it below which, a wrong unit is likely.
 MAX_EXTENT_M, MIN_RISE = 5.0, 1e-3
+
+# Largest depths beyond which a wrong unit is likely.
+MIN_DEPTH_M, MAX_DEPTH_M = 2e-3, 2.0
 
 # Distance from the origin, in lengths of the sheet, from which rounding matters.
 MAX_DISTANCE = 20.0
@@ -104,11 +108,14 @@ def surface_notes(scene: Scene) -> Iterator[str]:
             "large holes out by sheet.mask"
         )
     extents = np.sort(np.ptp(rest.box, axis=0))
-    if surface.has_own_size and extents[2] > MAX_EXTENT_M:
+    if isinstance(rest, PicturedRest) and surface.depth:
+        near, far = depth_range(rest)
+        if not MIN_DEPTH_M < far < MAX_DEPTH_M:
+            fault = f"depths of {near:.3g} to {far:.3g} m are unlikely; unit: {surface.depth.unit} is the length"
+            yield f"sheet.surface.depth: {fault} of a count, 1.0e-5 m for hundredths of a millimetre"
+    elif surface.has_own_size and extents[2] > MAX_EXTENT_M:
         fault = f"{extents[2]:.3g} m is long for tissue; if these are millimetres, take unit: mm"
         yield f"sheet.surface.{surface.kind}: {fault}"
-    elif surface.depth:
-        pass  # The camera may be anywhere.
     elif (distance := float(np.linalg.norm(rest.box.mean(axis=0)))) > MAX_DISTANCE * extents[2]:
         fault = f"{distance:.3g} m from the origin, {distance / extents[2]:.0f} times its length"
         yield f"sheet.surface: {fault}, where f32 and pictures lose digits; subtract the mean of its points"
@@ -162,9 +169,18 @@ def _describe_file(rest: CurvedRest, record: SurfaceRecord) -> Iterator[str]:
         square, shape = list(square_points(rest)), list(rest.position.shape[:2])
         remedy = "square" if square == shape else f"square with sheet.points: {square}"
         yield f"surface: cells of the even grid are {aspect(rest):.3g} times as wide as high, {remedy}"
+    if isinstance(rest, PicturedRest):
+        near, far = (1000 * depth for depth in depth_range(rest))
+        yield f"surface: {near:.4g} to {far:.4g} mm from the camera, along its direction"
     if rest.origin.deviation is not None:
         deviation = f"smoothed by {rest.origin.deviation:.3g} px" if rest.origin.deviation else "not smoothed"
         yield f"surface: {record['filled']:.2%} of the pixels are filled in, as they have no depth; {deviation}"
+
+
+def depth_range(rest: PicturedRest) -> tuple[float, float]:
+    """Return the least and the largest depth of a sheet at rest from the camera of its picture [m]."""
+    depths = rest.picture.view.project(rest.present_positions)[:, 3]
+    return float(depths.min()), float(depths.max())
 
 
 def _describe_isotropy(rest: CurvedRest, record: SurfaceRecord) -> str:

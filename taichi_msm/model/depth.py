@@ -102,7 +102,8 @@ def read_relief(section: DepthMap, frame: Frame, picture: Picture, mask: SheetMa
     if is_endless.any():
         row, column = np.unravel_index(int(is_endless.argmax()), inverse.shape)
         remedy = "cut the region, or leave the place out by sheet.mask"
-        raise PictureError(f"{path}: the depth has no end at {_pixel(column, row, frame)}", remedy)
+        fault = f"its smoothed depth jumps to infinity at {_pixel(column, row, frame)}"
+        raise PictureError(f"{path}: {fault}, beside much smaller ones", remedy)
     return Relief(_in_world(inverse, picture), filled, float(deviation), key)
 
 

@@ -198,7 +198,10 @@ def read_run(directory: str | Path) -> FinishedRun:
         run = FinishedRun(
             path.parent, record["status"], scene, frames, largest_frame, sha256, overrides, data, scene.render.main
         )
-        run._require_same(scene.sheet.files)  # without which there is no sheet
+        # Without these files there is no sheet; a camera's picture has the size that the surface follows from.
+        is_framed = scene.sheet.surface is not None and scene.sheet.surface.frame_key is not None
+        image = {"image": scene.image} if is_framed and scene.image is not None else {}
+        run._require_same(scene.sheet.files | image)
         run = replace(run, scene=scene.model_copy(update={"sheet": run._frozen_sheet()}))
         problems = [*try_plan(run.scene)[1], *camera_problems(run.scene)]
         # Other problems are ignored: later methods check the pictures, and the step was valid with the original map.

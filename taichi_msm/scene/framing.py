@@ -152,8 +152,10 @@ def _chain(render: Render, name: str | None, key: tuple[str, ...]) -> tuple[Came
     while True:
         camera = cameras[current]
         if not isinstance(camera, Camera):
-            remedy = "give it intrinsics, a calibration or fov"
-            raise scene_fault(f"the camera is {camera}, which took no picture; {remedy}", *key)
+            # The main camera, if no other one is named.
+            place = key if name or current else ("render", "camera")
+            text = f"{camera} took no picture; set the camera that took image, such as {{fov: 60}}, or with intrinsics"
+            raise scene_fault(f"{text} or calibration", *place)
         chain.append(camera)
         if camera.eye is not None and "target" not in camera.model_fields_set:
             raise scene_fault("the camera has no target, and the surface follows from its direction; add target", *key)

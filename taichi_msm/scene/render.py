@@ -200,8 +200,9 @@ def _read_files(camera: AnyCamera, info: ValidationInfo) -> AnyCamera:
         return camera
     camera = camera.with_poses()
     # An invalid size is reported separately.
-    size = _calibrated_size.get() or info.data.get("size")
-    return camera.calibrated(size) if size else camera
+    if image_size := _calibrated_size.get():
+        return camera.calibrated(image_size, of_image=True)
+    return camera.calibrated(info.data["size"]) if "size" in info.data else camera
 
 
 def _check_reference_camera(name: str, cameras: Mapping[str, AnyCamera]) -> None:
