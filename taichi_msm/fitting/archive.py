@@ -10,6 +10,7 @@ from __future__ import annotations
 import re
 import zipfile
 from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -44,6 +45,7 @@ def read_observations(observed: str | Path | Mapping[str, Any], rate: float) -> 
     else:
         name = str(observed)
         arrays, names = _read_archive(name)
+    is_mesh = "coordinates" not in arrays
     arrays = _convert_trajectory(_apply_masks(name, arrays, rate))
     kinds = [kind for kind in KINDS if kind in arrays]
     missing = [key for key in ("time", "coordinates") if key not in arrays]
@@ -53,7 +55,8 @@ def read_observations(observed: str | Path | Mapping[str, Any], rate: float) -> 
         raise SceneError([f"{name}: {missing[0]}: missing; expected {NEEDS}, and it has {listed}{suggestion}"])
     if len(kinds) == 2:
         raise SceneError([f"{name}: has both position and pixel; leave one of them out"])
-    return _build_observation(name, arrays, kinds[0]).with_sigma(arrays.get("sigma"))
+    observation = replace(_build_observation(name, arrays, kinds[0]), is_mesh=is_mesh)
+    return observation.with_sigma(arrays.get("sigma"))
 
 
 def _build_observation(name: str, arrays: Arrays, kind: str) -> PointObservation:
@@ -105,7 +108,7 @@ def _apply_masks(name: str, arrays: Arrays, rate: float) -> Arrays:
 
 
 def _convert_trajectory(arrays: Arrays) -> Arrays:
-    """Convert the arrays of a trajectory.npz, with at most 64 points per side."""
+    """Convert the arrays of a trajectory.npz, with at most 64 points per side; coordinates are (u, v)."""
     position = arrays.get("position")
     if position is None or position.ndim != 4 or min(position.shape[:3]) == 0 or "coordinates" in arrays:
         return arrays

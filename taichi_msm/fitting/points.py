@@ -113,6 +113,7 @@ class PointObservation(Observation):
     sigma: float | None
     coordinates: Array  # across and down as fractions of the sheet, shape (N, 2)
     off_sheet: int = 0  # number of points that `on_sheet` left out
+    is_mesh: bool = False  # whether `coordinates` are (u, v) of a mesh, which `on_sheet` converts
 
     @property
     def is_observed(self) -> NDArray[np.bool_]:
@@ -126,7 +127,10 @@ class PointObservation(Observation):
 
     def on_sheet(self, scene: Scene) -> Self:
         """Return the observation without points that fall on no sheet; raise a SceneError if none remains."""
-        if (covered := rest_of(scene.sheet).covers(self.coordinates)).all():
+        rest = rest_of(scene.sheet)
+        if self.is_mesh:
+            return replace(self, coordinates=rest.sheet_places(self.coordinates), is_mesh=False).on_sheet(scene)
+        if (covered := rest.covers(self.coordinates)).all():
             return self
         if not self.is_observed[covered].any():
             fault = "all observed points fall on no sheet"
