@@ -105,12 +105,14 @@ def _inverse_hessian(surface: Surface, objective: GridObjective, p: Array) -> Ca
     def solve(values: Array, weight: float, other_weight: float) -> Array:
         """Solve for one component, which is 0 at both ends of axis 0, for the weights of differences along the axes."""
         n, m = (count - 1 for count in values.shape)
+        result = np.zeros_like(values)
+        if n == 1:  # All points are on sides.
+            return result
         end_weights = np.ones(m + 1)
         end_weights[[0, -1]] = 0.5
         along, other = np.pi * np.arange(1, n) / n, np.pi * np.arange(m + 1) / m
         eigenvalues = weight * (2 - 2 * np.cos(along))[:, None] + other_weight * (2 - 2 * np.cos(other))
         spectrum = dct(dst(values[1:-1], 1, axis=0, norm="ortho") / end_weights, 1) / eigenvalues
-        result = np.zeros_like(values)
         result[1:-1] = dst(dct(spectrum, 1), 1, axis=0, norm="ortho") / (2 * m)
         return result
 
