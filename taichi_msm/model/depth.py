@@ -60,6 +60,8 @@ def read_relief(section: DepthMap, frame: Frame, picture: Picture, mask: SheetMa
     if numbers.shape[1::-1] != frame.image_size:
         sizes = "{1} x {0}".format(*numbers.shape), "{} x {}".format(*frame.image_size)
         raise PictureError(f"{path} has {sizes[0]} pixels, and the image {sizes[1]}", "give the depth of every pixel")
+    if min(width, height) < 2:
+        raise PictureError(f"{path} has {width} x {height} pixels in the region", "take at least 2 x 2")
     require_memory(path, DEPTH_PIXEL_BYTES * width * height, "cut the region, or scale the picture down")
     known = depth_map.DepthMap.of(numbers[y : y + height, x : x + width], section.metres)
     centres = np.stack(np.meshgrid(np.arange(width) + 0.5, np.arange(height) + 0.5), axis=-1)

@@ -196,8 +196,9 @@ def _read_files(camera: AnyCamera, info: ValidationInfo) -> AnyCamera:
         return camera
     camera = camera.with_poses()
     # An invalid size is reported separately.
-    size = _calibrated_size.get() or info.data.get("size")
-    return camera.calibrated(size) if size else camera
+    image_size = _calibrated_size.get()
+    size = image_size or info.data.get("size")
+    return camera.calibrated(size, is_image=image_size is not None) if size else camera
 
 
 def _check_reference_camera(name: str, cameras: Mapping[str, AnyCamera]) -> None:
