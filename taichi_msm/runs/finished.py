@@ -22,6 +22,7 @@ from taichi_msm.model.sheet import rest_positions
 from taichi_msm.render.camera import camera_problems
 from taichi_msm.runs.arrays import map_array
 from taichi_msm.runs.directory import FILE, FOLDER, MAX_RECORD_BYTES, entry_kind
+from taichi_msm.scene.framing import is_framed
 from taichi_msm.scene.outputs import OUTPUTS, REST_FILE, RUN_RECORD, SWEEP_RECORD
 from taichi_msm.scene.scene import Scene
 from taichi_msm.scene.sheet import Sheet
@@ -100,13 +101,7 @@ class FinishedRun:
 
     def _require_same(self, files: Mapping[str, str]) -> None:
         for key, path in files.items():
-            fault = f"{path} differs from the file of the run (SHA-256)"
-            try:
-                if file_sha256(path) == self.sha256.get(key):
-                    continue
-            except PictureError as error:
-                fault = error.fault
-            raise FilesError(f"{self.directory}: {key}: {fault}; {RESTORE_PICTURE}")
+            _require_digest(path, self.sha256.get(key), f"{self.directory}: {key}")
 
     def _frozen_sheet(self) -> Sheet:
         """Return the sheet with the even grid in rest.npz, if it has one."""
@@ -189,8 +184,11 @@ def read_run(directory: str | Path) -> FinishedRun:
             raise FilesError(f"{path}: {entry_kind(path)}, which no run writes; name the folder that `run --out` wrote")
         data = read_regular(path, MAX_RECORD_BYTES)
         record = json.loads(data)
-        scene, frames = _read_scene(record), record["frames"]
         sha256, overrides = _DIGESTS.validate_python(record["sha256"]), _OVERRIDES.validate_python(record["overrides"])
+        if is_framed(record["scene"]):  # The size of the image is that of the cameras.
+            with use_folder(Path(record["working_directory"])):
+                _require_digest(record["scene"]["image"], sha256.get("image"), f"{path.parent}: image")
+        scene, frames = _read_scene(record), record["frames"]
         is_resolved = scene.time.precision != "auto" and scene.sheet.tolerance is scene.time.tolerance is None
         if not isinstance(frames, int) or not 1 <= frames <= scene.time.frames + 1 or not is_resolved:
             raise damaged_result(path)
@@ -198,10 +196,7 @@ def read_run(directory: str | Path) -> FinishedRun:
         run = FinishedRun(
             path.parent, record["status"], scene, frames, largest_frame, sha256, overrides, data, scene.render.main
         )
-        # Without these files there is no sheet; a camera's picture has the size that the surface follows from.
-        is_framed = scene.sheet.surface is not None and scene.sheet.surface.frame_key is not None
-        image = {"image": scene.image} if is_framed and scene.image is not None else {}
-        run._require_same(scene.sheet.files | image)
+        run._require_same(scene.sheet.files)  # without which there is no sheet
         run = replace(run, scene=scene.model_copy(update={"sheet": run._frozen_sheet()}))
         problems = [*try_plan(run.scene)[1], *camera_problems(run.scene)]
         # Other problems are ignored: later methods check the pictures, and the step was valid with the original map.
@@ -237,3 +232,14 @@ def _read_scene(record: Mapping[str, Any]) -> Scene:
     if folder != Path.cwd():
         scene = scene.with_pictures(lambda path: str(folder / path))
     return scene
+
+
+def _require_digest(path: str, sha256: str | None, name: str) -> None:
+    """Raise a FilesError unless the file has the SHA-256; `name` has the folder of the run and the scene key."""
+    fault = f"{path} differs from the file of the run (SHA-256)"
+    try:
+        if file_sha256(path) == sha256:
+            return
+    except PictureError as error:
+        fault = error.fault
+    raise FilesError(f"{name}: {fault}; {RESTORE_PICTURE}")

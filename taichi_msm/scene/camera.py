@@ -347,10 +347,11 @@ class Camera(Section):
         kept = {name: getattr(self, name) for name in self.model_fields_set - {*PoseKeys._fields}}
         return self.model_validate(kept | {"poses": rows})
 
-    def calibrated(self, size: tuple[int, int], *, of_image: bool = False) -> Self:
+    def calibrated(self, size: tuple[int, int], *, is_image: bool = False) -> Self:
         """Return a copy with the intrinsics and the distortion of the calibration in place of its file.
 
-        Without a file, return the camera itself. `size` is the width and height of the pictures [px], or `of_image`.
+        Without a file, return the camera itself. `size` is the width and height of the pictures [px], or with
+        `is_image` those of the scene's image.
         """
         if self.calibration is None:
             given = self.intrinsics
@@ -371,12 +372,12 @@ class Camera(Section):
         scale_x, scale_y = (new / old for new, old in zip(size, calibration.size or size, strict=True))
         if (scale_x, scale_y) != (1, 1) and not self.scale:
             assert calibration.size is not None
-            subject, remedy = "render.size is", f"set render.size: {list(calibration.size)}, or scale: true"
-            if of_image:
-                subject, remedy = "the image has", "set scale: true, if it was resized"
+            name, remedy = "render.size", f"set render.size: {list(calibration.size)}, or scale: true"
+            if is_image:
+                name, remedy = "the image", "take an image of that size, or set scale: true"
             raise scene_fault(
                 f"{self.calibration}: calibrates pictures of {calibration.size[0]} x {calibration.size[1]} pixels, and "
-                f"{subject} {size[0]} x {size[1]}; {remedy}",
+                f"{name} is {size[0]} x {size[1]}; {remedy}",
                 "calibration",
             )
         calibration = calibration.scaled(scale_x, scale_y)

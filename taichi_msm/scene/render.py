@@ -51,11 +51,7 @@ class Light(Section):
     """Light of `shading: tissue`, from a source next to the camera."""
 
     ambient: UnitInterval = key(0.2, "ambient fraction of the light", "a number, 0 to 1")
-    gloss: UnitInterval = key(
-        0.4,
-        "brightness of the wet highlight, as a fraction of white; by default 0 on a picture by a camera",
-        "a number, 0 to 1",
-    )
+    gloss: UnitInterval = key(0.4, "brightness of the wet highlight, as a fraction of white", "a number, 0 to 1")
     relief: Annotated[Number, Field(ge=-10, le=10)] = key(
         0.0, "height of white above black in the image, in percent of the sheet's larger side", "a number, -10 to 10"
     )
@@ -200,9 +196,9 @@ def _read_files(camera: AnyCamera, info: ValidationInfo) -> AnyCamera:
         return camera
     camera = camera.with_poses()
     # An invalid size is reported separately.
-    if image_size := _calibrated_size.get():
-        return camera.calibrated(image_size, of_image=True)
-    return camera.calibrated(info.data["size"]) if "size" in info.data else camera
+    image_size = _calibrated_size.get()
+    size = image_size or info.data.get("size")
+    return camera.calibrated(size, is_image=image_size is not None) if size else camera
 
 
 def _check_reference_camera(name: str, cameras: Mapping[str, AnyCamera]) -> None:

@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from PIL import Image
 
 from taichi_msm.accuracy.mesh import with_points
 from taichi_msm.cli import console
@@ -27,7 +28,7 @@ from taichi_msm.system import array_cache
 from taichi_msm.system.runtime import Device
 from taichi_msm.view.recording import Captures
 from tests.conftest import Program
-from tests.depths import wall, write_depth_scene
+from tests.depths import HEIGHT, WIDTH, wall, write_depth_scene
 from tests.golden import Messages
 from tests.outputs import files, results
 from tests.runs.test_finished import record, sha256
@@ -96,6 +97,12 @@ def test_repeated_run(depth: Path, program: Program, monkeypatch: pytest.MonkeyP
     Path("first/rest.npz").write_bytes(content)
     np.save("depth.npy", wall(0.3))
     message(program("run", "--again", "first", "--out", "third").stderr, "sheet.surface.depth.file")
+    np.save("depth.npy", wall())
+    # Without the image, or with one of another size, there is no sheet.
+    Image.open("frame.png").resize((2 * WIDTH, 2 * HEIGHT)).save("frame.png")
+    message(program("run", "--again", "first", "--out", "third").stderr, "first: image: frame.png differs")
+    Path("frame.png").unlink()
+    message(program("run", "--again", "first", "--out", "third").stderr, "first: image: frame.png")
     assert not Path("third").exists()
 
 

@@ -52,6 +52,12 @@ def change(*replacements: tuple[str, str]) -> str:
 DEPTH = "depth: {file: depth.npy, unit: mm}"
 LENS = "{intrinsics: {fx: 40, fy: 40, cx: 23.5, cy: 17.5}}"
 CAMERA = f"camera: {LENS}"
+CALIBRATION = """\
+image_width: 96
+image_height: 72
+camera_matrix: {rows: 3, cols: 3, data: [40, 0, 23.5, 0, 40, 17.5, 0, 0, 1]}
+distortion_coefficients: {rows: 1, cols: 5, data: [0, 0, 0, 0, 0]}
+"""
 SIZE = ("[9, 11]", "[9, 11]\n  size: [1, 1]")
 KEYS: dict[str, tuple[list[tuple[str, str]], str]] = {
     "no unit": ([("depth.npy, unit: mm", "depth.npy")], "scene.yaml:5:5: sheet.surface.depth.unit: missing"),
@@ -94,6 +100,11 @@ KEYS: dict[str, tuple[list[tuple[str, str]], str]] = {
     "grid": ([(DEPTH, f"{DEPTH}\n    grid: uneven")], "scene.yaml:6:5: sheet.surface.grid:"),
     "smooth": ([("unit: mm", "unit: mm, smooth: -1")], "sheet.surface.depth.smooth:"),
     "along": ([("unit: mm", "unit: mm, along: z")], "sheet.surface.depth.along:"),
+    "calibration of another size": (
+        [(LENS, "{calibration: camera.yaml}")],
+        "scene.yaml:10:19: render.camera.calibration: camera.yaml",
+    ),
+    "narrow region": ([("frame.png\n", "frame.png\nregion: [40, 0, 1, 20]\n")], "sheet.surface.depth.file: depth.npy"),
     "region": ([("frame.png\n", "frame.png\nregion: [40, 0, 20, 20]\n")], "region: [40, 0, 20, 20]"),
 }  # fmt: skip
 
@@ -101,6 +112,7 @@ KEYS: dict[str, tuple[list[tuple[str, str]], str]] = {
 @pytest.mark.parametrize("name", KEYS)
 def test_invalid_keys(name: str, depth: Path, message: Messages) -> None:
     replacements, place = KEYS[name]
+    Path("camera.yaml").write_text(CALIBRATION)
     with message.raises(SceneError, place) as caught:
         load_scene(change(*replacements))
     assert "\n" not in str(caught.value)

@@ -137,6 +137,12 @@ def test_points_of_a_grid() -> None:
     assert mean_isotropy_error(x) < 0.01 < 0.1 < mean_isotropy_error(positions(surface, given_grid((21, 26))))
 
 
+@pytest.mark.parametrize("points", [(2, 2), (2, 9), (9, 2)])
+def test_points_on_sides_alone(points: tuple[int, int]) -> None:
+    """Those of a plane across the view stay, also across the sides that have no others."""
+    assert even_grid(depth_surface(plane(0), sight), points).fractions == pytest.approx(given_grid(points), abs=1e-5)
+
+
 def test_turned_corners_are_refused() -> None:
     p = given_grid((3, 3))
     assert is_unfolded(p)
