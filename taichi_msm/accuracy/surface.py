@@ -24,6 +24,7 @@ from taichi_msm.model.surface_checks import (
     square_points,
 )
 from taichi_msm.scene.scene import Scene
+from taichi_msm.scene.surface import METRES
 from taichi_msm.terms import fictitious_masses
 from taichi_msm.terms.elasticity import spring_families
 
@@ -111,8 +112,10 @@ def surface_notes(scene: Scene) -> Iterator[str]:
     if isinstance(rest, PicturedRest) and surface.depth:
         near, far = depth_range(rest)
         if not MIN_DEPTH_M < far < MAX_DEPTH_M:
-            fault = f"depths of {near:.3g} to {far:.3g} m are unlikely; unit: {surface.depth.unit} is the length"
-            yield f"sheet.surface.depth: {fault} of a count, 1.0e-5 m for hundredths of a millimetre"
+            remedy = "unit: 1.0e-5 is for counts of a hundredth of a millimetre"
+            if MIN_DEPTH_M < METRES["mm"] / surface.depth.metres * far < MAX_DEPTH_M:
+                remedy = "if these are millimetres, take unit: mm"
+            yield f"sheet.surface.depth: depths of {near:.3g} to {far:.3g} m are unlikely for tissue; {remedy}"
     elif surface.has_own_size and extents[2] > MAX_EXTENT_M:
         fault = f"{extents[2]:.3g} m is long for tissue; if these are millimetres, take unit: mm"
         yield f"sheet.surface.{surface.kind}: {fault}"

@@ -69,10 +69,10 @@ KEYS: dict[str, tuple[list[tuple[str, str]], str]] = {
     "unreadable image": ([("frame.png", "scene.yaml")], "scene.yaml:1:1: image: scene.yaml"),
     "missing file": ([("depth.npy", "missing.npy")], "scene.yaml:5:13: sheet.surface.depth.file: missing.npy"),
     "file of another folder": ([("depth.npy", "../depth.npy")], "scene.yaml:5:13: sheet.surface.depth.file:"),
-    "no camera": ([(f"render: {{{CAMERA}}}\n", "")], "sheet.surface.depth"),
-    "camera top": ([(CAMERA, "camera: top")], "sheet.surface.depth"),
+    "no camera": ([(f"render: {{{CAMERA}}}\n", "")], "render.camera"),
+    "camera top": ([(CAMERA, "camera: top")], "render.camera"),
     "camera oblique": ([(CAMERA, "cameras: {left: oblique}")], "sheet.surface.depth"),
-    "camera fit": ([(CAMERA, "camera: fit"), ("unit: mm", "unit: mm, along: ray")], "sheet.surface.depth"),
+    "camera fit": ([(CAMERA, "camera: fit"), ("unit: mm", "unit: mm, along: ray")], "render.camera"),
     "camera without a lens": ([(LENS, "{eye: [0, 0, 1], target: [0, 0, 0]}")], "sheet.surface.depth"),
     "camera at the origin without a lens": ([(LENS, "{}")], "sheet.surface.depth"),
     "camera without a target": ([(LENS, "{eye: [0, 0, 1], fov: 40}")], "sheet.surface.depth"),
@@ -218,6 +218,8 @@ def test_notes(depth: Path, message: Messages) -> None:
     message(lines(), "9.3% of the pixels")
     np.save("depth.npy", wall())
     message(next(iter(lines("sheet.surface.depth.unit=m"))), "unit: mm")
+    np.save("depth.npy", 100 * wall())
+    message(next(iter(lines())), "unit: 1.0e-5")
     np.save("depth.npy", wall(height=12.0))
     message(next(iter(lines("sheet.surface.grid=given", "sheet.surface.depth.smooth=0"))), "grid: even")
 
