@@ -164,7 +164,8 @@ def _describe_file(rest: CurvedRest, record: SurfaceRecord) -> Iterator[str]:
         yield f"surface: cells of the even grid are {aspect(rest):.3g} times as wide as high, {remedy}"
     if rest.origin.deviation is not None:
         deviation = f"smoothed by {rest.origin.deviation:.3g} px" if rest.origin.deviation else "not smoothed"
-        yield f"surface: {record['filled']:.2%} of the pixels are filled in, as they have no depth; {deviation}"
+        share = f"{record['filled']:.2%} of the pixels are filled in, as they have no depth"
+        yield f"surface: {share if record['filled'] else 'all pixels have a depth'}; {deviation}"
 
 
 def _describe_isotropy(rest: CurvedRest, record: SurfaceRecord) -> str:
