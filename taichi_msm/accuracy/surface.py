@@ -177,7 +177,8 @@ def _describe_file(rest: CurvedRest, record: SurfaceRecord) -> Iterator[str]:
         yield f"surface: {near:.4g} to {far:.4g} mm from the camera, along its direction"
     if rest.origin.deviation is not None:
         deviation = f"smoothed by {rest.origin.deviation:.3g} px" if rest.origin.deviation else "not smoothed"
-        yield f"surface: {record['filled']:.2%} of the pixels are filled in, as they have no depth; {deviation}"
+        share = f"{record['filled']:.2%} of the pixels are filled in, as they have no depth"
+        yield f"surface: {share if record['filled'] else 'all pixels have a depth'}; {deviation}"
 
 
 def depth_range(rest: PicturedRest) -> tuple[float, float]:

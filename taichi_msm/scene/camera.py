@@ -350,8 +350,11 @@ class Camera(Section):
     def calibrated(self, size: tuple[int, int], *, is_image: bool = False) -> Self:
         """Return a copy with the intrinsics and the distortion of the calibration in place of its file.
 
-        Without a file, return the camera itself. `size` is the width and height of the pictures [px], or with
-        `is_image` those of the scene's image.
+        Without a file, return the camera itself.
+
+        Args:
+            size: width and height of the pictures [px].
+            is_image: whether they are those of the scene's image, not render.size.
         """
         if self.calibration is None:
             given = self.intrinsics
