@@ -18,6 +18,7 @@ from taichi_msm.errors import ProgressCallback
 from taichi_msm.images import PictureError
 from taichi_msm.scene.surface import Frame
 from taichi_msm.surfaces.even_grid import FoldedGridError, even_grid
+from taichi_msm.surfaces.grid_objective import is_unfolded
 from taichi_msm.surfaces.splines import GridSpline
 from taichi_msm.surfaces.surface import Surface
 from taichi_msm.system.array_cache import cached_arrays
@@ -70,7 +71,7 @@ def _read_or_compute(surface: Surface, points: tuple[int, int], digest: str) -> 
         # NumPy would leave a damaged file open.
         with path.open("rb") as file, np.load(file, allow_pickle=False) as archive:
             grid = archive["grid"]
-        if grid.shape == (*points, 2) and grid.dtype == np.float64:
+        if grid.shape == (*points, 2) and grid.dtype == np.float64 and is_unfolded(grid):
             path.touch()
             return grid
     try:

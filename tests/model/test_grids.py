@@ -60,7 +60,7 @@ def test_kept_by_key(surface: Surface, computed: list[int]) -> None:
     assert sorted(path.suffix for path in user_folder().iterdir()) == [".npz", ".npz"]
 
 
-@pytest.mark.parametrize("damage", ["empty", "truncated", "flipped", "another shape", "a folder"])
+@pytest.mark.parametrize("damage", ["empty", "truncated", "flipped", "another shape", "turned over", "a folder"])
 def test_damaged_files_are_ignored(damage: str, surface: Surface, computed: list[int]) -> None:
     first = grid(surface)
     (file,) = user_folder().iterdir()
@@ -73,6 +73,8 @@ def test_damaged_files_are_ignored(damage: str, surface: Surface, computed: list
         file.mkdir()
     elif damage == "another shape":
         np.savez(file, grid=np.zeros((3, 3, 2)))
+    elif damage == "turned over":
+        np.savez(file, grid=first[::-1])
     else:
         file.write_bytes({"empty": b"", "truncated": content[: len(content) // 2], "flipped": flipped}[damage])
     np.testing.assert_array_equal(grid(surface), first)
