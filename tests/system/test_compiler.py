@@ -131,6 +131,7 @@ print(active_compiler().folder(), ti.lang.impl.current_cfg().offline_cache_file_
 def test_folder_of_compiled_kernels(named: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     variable = active_compiler().folder_variable
     monkeypatch.delenv(variable)
+    monkeypatch.delenv("XDG_CACHE_HOME")
     done = python(tmp_path, FOLDERS, HOME=str(tmp_path), **({variable: str(tmp_path / "kernels")} if named else {}))
     expected, actual = done.stdout.split("\n")[-2].split("|")
     assert expected == actual == str(tmp_path / "kernels" if named else tmp_path / active_compiler().cache)
