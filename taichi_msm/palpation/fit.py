@@ -21,6 +21,7 @@ import numpy as np
 from scipy.optimize import brentq, minimize_scalar
 
 from taichi_msm.arithmetic import Array
+from taichi_msm.errors import ProgressCallback
 from taichi_msm.palpation.law import BallLaw
 from taichi_msm.palpation.presses import Presses
 
@@ -35,6 +36,9 @@ FIRST_OFFSETS = np.linspace(-0.5, 1.0, 16)
 
 # The estimates of s, c and t alternate with those of the offsets until log L changes by less than `TOLERANCE`.
 TOLERANCE, MAX_ROUNDS, STEPS, HALVINGS = 0.01, 40, 2, 4
+
+# Largest change of the lock when presses are left out, as a factor.
+MAX_CHANGE = 1.3
 
 # Least standard deviations: s relative to the peak, and t [m].
 MIN_NOISE, MIN_WIDTH = 1e-9, 1e-7
@@ -62,12 +66,12 @@ class PressFit:
     log_likelihood: float
 
 
-def fit_presses(presses: Presses, radius: float, pause: Callable[[], None] = lambda: None) -> PressFit:
+def fit_presses(presses: Presses, radius: float, progress: ProgressCallback = lambda done, total: None) -> PressFit:
     """Fit the lock, and stiffness and offset of each press, of a ball of a radius [m]."""
     linear = best = fit_offsets(presses, BallLaw(radius))
     locks, fits = LOCKS * float(presses.greatest_depth.max()), list[PressFit]()
     for lock in locks:
-        pause()
+        progress(len(fits), len(locks))
         fits.append(fit_offsets(presses, BallLaw(radius, lock), (fits or [linear])[-1]))
     n = max(range(len(fits)), key=lambda k: fits[k].log_likelihood)
     if fits[n].log_likelihood > linear.log_likelihood:
@@ -77,9 +81,16 @@ def fit_presses(presses: Presses, radius: float, pause: Callable[[], None] = lam
 
 def refine_lock(presses: Presses, start: PressFit, low: float, high: float) -> PressFit:
     """Return the fit with the best lock between two [m]."""
-
     lock = _minimise(lambda lock: -at_lock(presses, start, lock).log_likelihood, low, high)
     return max(start, at_lock(presses, start, lock), key=lambda fit: fit.log_likelihood)
+
+
+def refit(presses: Presses, start: PressFit) -> PressFit:
+    """Return the fit to other presses, with a lock near that of `start`, whose offsets are of these presses."""
+    lock = start.law.lock
+    if math.isinf(lock):
+        return at_lock(presses, start, lock)
+    return refine_lock(presses, at_lock(presses, start, lock), lock / MAX_CHANGE, lock * MAX_CHANGE)
 
 
 def lock_interval(presses: Presses, best: PressFit) -> tuple[float, float | None]:
@@ -206,7 +217,6 @@ class _Model:
 
 def _minimise(loss: Callable[[float], float], low: float, high: float) -> float:
     """Return the minimum of a function of a positive number."""
-    found = minimize_scalar(
-        lambda x: loss(math.exp(x)), bounds=(math.log(low), math.log(high)), method="bounded", options={"xatol": 1e-3}
-    )
+    ends = math.log(low), math.log(high)
+    found = minimize_scalar(lambda x: loss(math.exp(x)), bounds=ends, method="bounded", options={"xatol": 1e-3})
     return math.exp(found.x)

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
@@ -94,7 +95,7 @@ def choose_presses(table: Table) -> tuple[Presses, list[LeftOut]]:
         raise SceneError([f"{table.name}: {fault}; split the table, or choose their labels by {table.place_option}"])
     counts = np.bincount(index, minlength=len(names))
     starts = np.concatenate([[0], np.cumsum(counts)])
-    presses = [slice(start, end) for start, end in zip(starts[:-1], starts[1:], strict=True)]
+    presses = [slice(start, end) for start, end in pairwise(starts)]
     noise, left_out, kept = _noise(table, presses), list[LeftOut](), list[int]()
     for n, press in enumerate(presses):
         if reason := _reason(table.depth[press], table.force[press], noise):

@@ -1,7 +1,7 @@
 """Reader of tables of palpation: place, x, y, z, depth and force of each row, from a text or a workbook.
 
-Titles match whole, apart from their unit. With fx, fy and fz, the force is their part along the normal nx, ny, nz, which
-points out of the tissue and is z by default. Without labels of places, a press ends where the depth falls back.
+Titles match whole, apart from their unit. With fx, fy and fz, the force is their part along the normal nx, ny, nz,
+which points out of the tissue and is z by default. Without labels of places, a press ends where the depth falls back.
 """
 
 from __future__ import annotations
@@ -56,6 +56,7 @@ class Table:
     index: NDArray[np.intp]  # place of each row
     depth: Array  # [m], signed so that the largest magnitude is positive
     force: Array  # along the normal [N], signed likewise; 0 in tables without a force
+    normal: Array  # mean direction out of the tissue, shape (3,)
     digit: float  # resolution of the forces: their last digit in the file [N]
     notes: tuple[str, ...]
 
@@ -120,7 +121,7 @@ def _select_columns(grid: Grid, header: int, chosen: dict[str, str], *, with_for
     titles, found = grid.rows[header], _find_columns(grid.rows[header], chosen)
     first = next((n for n in range(header + 1, len(grid.rows)) if grid.has_content(n)), None)
     forces = COMPONENTS if all(found[name] for name in COMPONENTS) else ("force",)
-    normal = NORMAL if forces == COMPONENTS and any(found[name] for name in NORMAL) else ()
+    normal = NORMAL if any(found[name] for name in NORMAL) else ()
     needed = [*POSITION, "depth", *((*forces, *normal) if with_force else ())]
     if found["place"] or "place" in chosen:
         needed.append("place")
@@ -176,7 +177,10 @@ def _read_rows(grid: Grid, header: int, columns: dict[str, _Column]) -> Table:
         first = grid.place(without_force[0])
         notes.append(f"{grid.title}: rows without a force are left out: {len(without_force)}, the first at {first}")
     position = np.column_stack([numbers[name] for name in POSITION])
-    force = _force(grid, rows, columns, numbers)
+    normals = _normals(grid, rows, columns, numbers)
+    force = numbers.get("force", np.zeros(len(rows)))
+    if "fx" in numbers:
+        force = (np.column_stack([numbers[name] for name in COMPONENTS]) * normals).sum(axis=1)
     depth, signs = numbers["depth"], [_sign(numbers["depth"]), _sign(force)]
     if of_force and signs[0] != signs[1]:
         fault = "forces have another sign than depths"
@@ -198,7 +202,17 @@ def _read_rows(grid: Grid, header: int, columns: dict[str, _Column]) -> Table:
         remedy = f'if their unit is another, give it by --columns "x={x.title}, UNIT", and of y and z'
         where = f"{grid.place(header, x.index)}: {x.title}"
         raise SceneError([f"{where}: all places are within {extent:.2g} m; {remedy}"])
-    return Table(grid.title, tuple(places), centres, index[order], depth[order], force[order], digit, tuple(notes))
+    return Table(
+        grid.title,
+        tuple(places),
+        centres,
+        index[order],
+        depth[order],
+        force[order],
+        normals.mean(axis=0),
+        digit,
+        tuple(notes),
+    )
 
 
 def _sign(values: Array) -> float:
@@ -221,19 +235,16 @@ def _read_numbers(
     return numbers, digit
 
 
-def _force(grid: Grid, rows: list[int], columns: dict[str, _Column], numbers: dict[str, Array]) -> Array:
-    """Return the force of each row along the normal [N], or zeros without a force."""
-    if "fx" not in numbers:
-        return numbers.get("force", np.zeros(len(rows)))
-    vectors = np.column_stack([numbers[name] for name in COMPONENTS])
+def _normals(grid: Grid, rows: list[int], columns: dict[str, _Column], numbers: dict[str, Array]) -> Array:
+    """Return the unit normal of each row, shape (rows, 3)."""
     if "nx" not in numbers:
-        return vectors[:, 2].copy()
+        return np.tile([0.0, 0.0, 1.0], (len(rows), 1))
     normals = np.column_stack([numbers[name] for name in NORMAL])
     lengths = np.linalg.norm(normals, axis=1)
     if not lengths.all():
         where = grid.place(rows[int(lengths.argmin())], columns["nx"].index)
         raise SceneError([f"{where}: nx, ny and nz are 0; give the direction out of the tissue, or delete the row"])
-    return np.asarray((vectors * normals).sum(axis=1) / lengths)
+    return np.asarray(normals / lengths[:, None])
 
 
 def _split_presses(depth: Array) -> tuple[NDArray[np.bool_], NDArray[np.intp]]:
