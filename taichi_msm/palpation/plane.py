@@ -27,13 +27,12 @@ class Plane:
         """Return x, y and height [m] of points in space [m], shape (k, 3)."""
         return np.asarray((points - self.origin) @ self.axes.T)
 
-    def grid(self, rows: int, cols: int, *, at_centres: bool = False) -> Array:
-        """Return points of the tissue in space [m], shape (rows, cols, 3): the corners of cells, or the centres of pixels.
+    def pixels(self, rows: int, cols: int) -> Array:
+        """Return the centres of pixels over the rectangle, on the tissue in space [m], shape (rows, cols, 3).
 
-        Rows go down, from the greatest y.
+        The first row has the greatest y.
         """
-        shift = 0.5 if at_centres else 0.0
-        across, down = ((np.arange(n) + shift) / (n - 1 + 2 * shift) for n in (cols, rows))
+        across, down = ((np.arange(n) + 0.5) / n for n in (cols, rows))
         x, y = self.low[0] + across * self.size[0], self.low[1] + (1 - down) * self.size[1]
         points = np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2)
         distances, nearest = cKDTree(self.places[:, :2]).query(points, min(NEIGHBOURS, len(self.places)))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from pathlib import Path
 from typing import BinaryIO
 
 import numpy as np
@@ -57,7 +58,7 @@ def _save(draw: Callable[[Figure], None], height: float, file: BinaryIO) -> None
 
 def _draw_map(figure: Figure, result: Palpation, plane: Plane) -> None:
     cols, rows = (max(2, round(PIXELS * side / max(plane.size))) for side in plane.size)
-    points = plane.grid(rows, cols, at_centres=True).reshape(-1, 3)
+    points = plane.pixels(rows, cols).reshape(-1, 3)
     stiffness, low, high = result.map.stiffness(points)
     length = result.map.process.length
     is_unknown = cKDTree(result.presses.position).query(points)[0] > length
@@ -69,7 +70,7 @@ def _draw_map(figure: Figure, result: Palpation, plane: Plane) -> None:
     ends = np.nanmin([np.nanmin(stiffness), measured.min()]), np.nanmax([np.nanmax(stiffness), measured.max()])
     centre, ratio = np.sqrt(ends[0] * ends[1]), np.sqrt(max(ends[1] / ends[0], MIN_RATIO))
     norm = LogNorm(centre / ratio, centre * ratio)
-    figure.suptitle(f"Stiffness of {printable(result.name)}", x=0.01, ha="left", parse_math=False)
+    figure.suptitle(f"Stiffness of {printable(Path(result.name).name)}", x=0.01, ha="left", parse_math=False)
     left, right = figure.subplots(1, 2, sharey=True)
     grey = f"; grey: over {MM * length:.2g} mm from every press" if is_unknown.any() else ""
     _draw_panel(left, plane, stiffness, norm, "viridis", "stiffness [N/cm³]: dark soft, bright stiff")
@@ -81,22 +82,14 @@ def _draw_map(figure: Figure, result: Palpation, plane: Plane) -> None:
     right.set_title(f"Uncertainty{grey}")
     right.plot(*MM * plane.places[:, :2].T, ".", color="white", markersize=2)
     left.set_ylabel("across [mm]")
-    for n, name, dy in ((measured.argmax(), "stiffest", 6), (measured.argmin(), "softest", 6)):
+    for n, name in ((measured.argmax(), "stiffest"), (measured.argmin(), "softest")):
         label = f"{name}: place {printable(result.presses.places[n])}"
-        x, y = MM * plane.places[n, :2]
+        x, y, _ = MM * plane.places[n]
+        side = (plane.places[n, 0] - plane.low[0]) / plane.size[0]
+        alignment = "left" if side < 1 / 4 else "right" if side > 3 / 4 else "center"
         box = {"boxstyle": "round,pad=0.2", "facecolor": "white", "edgecolor": "none", "alpha": 0.8}
-        left.annotate(
-            label,
-            (x, y),
-            (0, dy),
-            textcoords="offset points",
-            ha="center",
-            va="bottom",
-            color=INK,
-            bbox=box,
-            fontsize=7,
-            parse_math=False,
-        )
+        shown = {"ha": alignment, "va": "bottom", "fontsize": 7, "parse_math": False, "bbox": box}
+        left.annotate(label, (x, y), (0, 6), textcoords="offset points", **shown)
 
 
 def _draw_panel(axes: Axes, plane: Plane, values: Array, norm: Normalize, colours: str, label: str) -> None:

@@ -26,8 +26,8 @@ SCENE, STIFFNESS, TISSUE = "scene.yaml", "pictures/stiffness.png", "pictures/tis
 # Largest spacing of the mass points, and margin of the sheet around the places, in radii of the ball.
 MAX_SPACING_RADII, MARGIN_RADII = 1 / 6, 2.0
 
-# Young's modulus of the sheet times its thickness, over K R^2; the thickness, and the depth of the foundation [m].
-SHEET_SHARE, THICKNESS, DEPTH = 1e-4, 1e-3, 0.01
+# Young's modulus of the sheet times its thickness, over K R^2; its thickness [m].
+SHEET_SHARE, THICKNESS = 1e-4, 1e-3
 
 # Time of the press [s], and frames per second.
 DURATION, RATE = 2.0, 10.0
@@ -49,7 +49,7 @@ def write_scene(folder: Path, result: Palpation) -> str:
     if max(rows, cols) > MAX_POINTS:
         fault = f"places over {max(plane.size):.3g} m need {rows} x {cols} mass points for a ball of {law.radius:g} m"
         return f"{SCENE} is left out: {fault}; is the unit of x, y and z right?"
-    stiffness, _, _ = built.stiffness(plane.grid(rows, cols, at_centres=True).reshape(-1, 3))
+    stiffness, _, _ = built.stiffness(plane.pixels(rows, cols).reshape(-1, 3))
     stiffness = stiffness.reshape(rows, cols)
     median = float(np.median(built.fit.mean_stiffness))
     low, high = float(stiffness.min()) / median, float(stiffness.max()) / median * (1 + 1e-6)
@@ -61,13 +61,15 @@ def write_scene(folder: Path, result: Palpation) -> str:
     across, down = plane.fractions(presses.position[pressed])
     (there,), _, _ = built.stiffness(presses.position[[pressed]])
     force = there * float(law.force(np.array([depth]))[0])
-    foundation = {"young": median * DEPTH, "depth": DEPTH}
+    # Deeper than three times the press, beyond which a run warns, in whole centimetres.
+    thickness = math.ceil(400 * depth) / 100
+    foundation = {"young": median * thickness, "depth": thickness}
     if math.isfinite(law.lock):
         foundation["lock"] = law.lock
     path = [[0, across, down, 0], [DURATION, across, down, -depth]]
     data: dict[str, Any] = {
         "image": TISSUE,
-        "sheet": {"points": [rows, cols], "size": [width, height], "fixed": "border"},
+        "sheet": {"points": [rows, cols], "size": [height, width], "fixed": "border"},
         "tissue": {
             "young": SHEET_SHARE * median * law.radius**2 / THICKNESS,
             "thickness": THICKNESS,
@@ -87,11 +89,13 @@ def write_scene(folder: Path, result: Palpation) -> str:
         "output": ["png", "gif", "trajectory", "forces"],
     }
     text = yaml.safe_dump(data, sort_keys=False, default_flow_style=None, width=120, allow_unicode=True)
-    comment = (
-        f"# Map of {printable(result.name)}: the ball goes {1000 * depth:.3g} mm deep at place {printable(presses.places[pressed])}, of\n"
-        f"# median stiffness, where the law of the presses has a force of {force:.4g} N. Of the foundation, only young / depth is\n"
-        "# known. Mass points stick to the ball, so a run warns of stretched springs next to it.\n"
-    )
+    place = f"place {printable(presses.places[pressed])}"
+    comment = f"""\
+# Map of {printable(result.name)}.
+# The ball goes {1000 * depth:.3g} mm deep at {place}, of median stiffness: {force:.4g} N by the law of the presses.
+# Only the ratio young / depth of the foundation is measured; lock is a parameter of the curve, not a thickness.
+# The sheet is too soft to matter. It sticks to the ball, so a run warns of its stretched springs.
+"""
     write_new_file(folder / SCENE, (comment + text).encode())
     return ""
 
@@ -99,7 +103,7 @@ def write_scene(folder: Path, result: Palpation) -> str:
 def _colour(plane: Plane, built: StiffnessMap) -> Array:
     """Return the map of log K as colours, shape (height, width, 3)."""
     cols, rows = _picture_size(plane)
-    stiffness, _, _ = built.stiffness(plane.grid(rows, cols, at_centres=True).reshape(-1, 3))
+    stiffness, _, _ = built.stiffness(plane.pixels(rows, cols).reshape(-1, 3))
     logs = np.log(stiffness)
     share = (logs - logs.min()) / max(np.ptp(logs), 1e-12)
     at = np.linspace(0, 1, len(COLOURS))
