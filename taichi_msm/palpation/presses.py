@@ -118,6 +118,8 @@ def _reason(depth: Array, force: Array, noise: float) -> str:
     if np.ptp(depth) <= 0 or depth.max() <= 0:
         return "the depth does not grow"
     rise = float(force[depth.argmax()] - force[depth.argmin()])
+    if rise < 0:
+        return f"the force falls by {-rise:.3g} N while the depth grows"
     if rise < RISE_NOISES * noise or force.max() <= 0:
         return f"the force rises by {rise:.3g} N, less than {RISE_NOISES:g} times the noise of {noise:.3g} N"
     return ""

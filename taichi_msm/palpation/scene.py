@@ -80,7 +80,7 @@ def write_scene(folder: Path, result: Palpation) -> str:
         "probes": [
             {
                 "path": path,
-                "instrument": {"radius": law.radius, "shaft": [0, 0, 1], "length": 10 * law.radius},
+                "instrument": {"radius": law.radius, "shaft": [0, 0, 1], "length": 4 * law.radius},
                 "friction": "rough",
             }
         ],

@@ -52,7 +52,7 @@ class Table:
 
     name: str  # of the file, with the sheet of a workbook
     places: tuple[str, ...]  # labels, n, including those of places without rows
-    position: Array  # of the places, those of their first rows [m], shape (n, 3)
+    position: Array  # of the places, those of their deepest rows [m], shape (n, 3)
     index: NDArray[np.intp]  # place of each row
     depth: Array  # [m], signed so that the largest magnitude is positive
     force: Array  # along the normal [N], signed likewise; 0 in tables without a force
@@ -95,8 +95,7 @@ def read_table(name: str, choices: Sequence[str] = (), sheet: str | None = None,
 
 
 def _is_header(row: Row, chosen: dict[str, str]) -> bool:
-    found = {quantity for quantity, columns in _find_columns(row, chosen).items() if columns}
-    return "depth" in found and len(found) >= MIN_TITLES
+    return sum(map(bool, _find_columns(row, chosen).values())) >= MIN_TITLES
 
 
 def _find_columns(row: Row, chosen: dict[str, str]) -> dict[str, list[int]]:
@@ -194,11 +193,11 @@ def _read_rows(grid: Grid, header: int, columns: dict[str, _Column]) -> Table:
         of_rows = [grid.cell(n, place.index) for n in rows]
     places = {label: n for n, label in enumerate(dict.fromkeys(labels))}
     index = np.array([places[label] for label in of_rows])
-    order, (present, first_rows) = np.argsort(index, kind="stable"), np.unique(index, return_index=True)
-    centres = np.full((len(places), 3), np.nan)
-    centres[present] = position[first_rows]
+    order = np.argsort(index, kind="stable")
+    centres, by_depth = np.full((len(places), 3), np.nan), np.argsort(depth, kind="stable")
+    centres[index[by_depth]] = position[by_depth]  # the deepest row is the last
     x = columns["x"]
-    if (extent := float(np.nanmax(np.ptp(centres[present], axis=0)))) < MIN_EXTENT:
+    if (extent := float(np.ptp(position, axis=0).max())) < MIN_EXTENT:
         remedy = f'if their unit is another, give it by --columns "x={x.title}, UNIT", and of y and z'
         where = f"{grid.place(header, x.index)}: {x.title}"
         raise SceneError([f"{where}: all places are within {extent:.2g} m; {remedy}"])
@@ -264,4 +263,7 @@ def _split_presses(depth: Array) -> tuple[NDArray[np.bool_], NDArray[np.intp]]:
         else:
             deepest, retreats = max(deepest, d), False
         numbers.append(press)
+    if retreats:
+        kept[-1] = False
+        numbers.pop()
     return kept, np.array(numbers)
