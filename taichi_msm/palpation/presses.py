@@ -114,7 +114,7 @@ def choose_presses(table: Table) -> tuple[Presses, list[LeftOut]]:
 def _reason(depth: Array, force: Array, noise: float) -> str:
     """Return the reason to leave a press out, or an empty string."""
     if len(depth) < MIN_ROWS:
-        return f"{len(depth)} rows with a force, fewer than {MIN_ROWS}"
+        return f"rows with a force: {len(depth)}, fewer than {MIN_ROWS}"
     if np.ptp(depth) <= 0 or depth.max() <= 0:
         return "the depth does not grow"
     rise = float(force[depth.argmax()] - force[depth.argmin()])

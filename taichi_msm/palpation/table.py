@@ -186,7 +186,7 @@ def _read_rows(grid: Grid, header: int, columns: dict[str, _Column]) -> Table:
         notes.append(f"{grid.title}: {fault}; each is taken so that its largest magnitude is positive")
     depth, force = signs[0] * depth + 0.0, signs[1] * force + 0.0
     if place is None:
-        kept, numbered = _split_presses(depth)
+        kept, numbered = _split_presses(depth) if of_force else _split_places(position, depth)
         position, depth, force, of_rows = position[kept], depth[kept], force[kept], numbered.astype(str).tolist()
         labels = of_rows
     else:
@@ -267,3 +267,9 @@ def _split_presses(depth: Array) -> tuple[NDArray[np.bool_], NDArray[np.intp]]:
         kept[-1] = False
         numbers.pop()
     return kept, np.array(numbers)
+
+
+def _split_places(position: Array, depth: Array) -> tuple[NDArray[np.bool_], NDArray[np.intp]]:
+    """Return the same as `_split_presses` for rows without a force, of which a place ends also where another begins."""
+    changes = np.any(np.diff(position, axis=0) != 0, axis=1) | (np.diff(depth) < 0)
+    return np.ones(len(depth), bool), np.append(0, np.cumsum(changes))
