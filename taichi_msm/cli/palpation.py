@@ -48,6 +48,6 @@ def parse_length(text: str) -> float:
     except (KeyError, ValueError):
         length = 0.0
     if not MIN_RADIUS <= length <= MAX_RADIUS:
-        expected = f"expected a length from {1e3 * MIN_RADIUS:g} mm to {1e3 * MAX_RADIUS:g} mm, such as 4mm; without a unit it is in metres"
-        raise click.BadParameter(f"{text}: {expected}", param_hint="--radius")
+        expected = f"expected a length from {1e3 * MIN_RADIUS:g} mm to {1e3 * MAX_RADIUS:g} mm, such as 4mm"
+        raise click.BadParameter(f"{text}: {expected}; without a unit it is in metres", param_hint="--radius")
     return length

@@ -26,7 +26,8 @@ from tests.conftest import Program
 from tests.golden import Messages
 from tests.palpation.synthetic import LOCK, Truth, log_stiffness, make_presses, write_table
 
-FILES = "curves.png map.png places.csv pictures/stiffness.png pictures/tissue.png predicted.csv scene.yaml".split()
+PICTURES = ["pictures/stiffness.png", "pictures/tissue.png"]
+FILES = ["curves.png", "map.png", "places.csv", *PICTURES, "predicted.csv", "scene.yaml"]
 
 # Where the tissue lies in the frame of the robot: x of the map along z, y along x, and the normal along y.
 ROTATION = np.array([[0.0, 0, 1], [1, 0, 0], [0, 1, 0]])
@@ -113,7 +114,7 @@ def test_scene_runs_alone(mapped: Path, truth: Truth, device: Device, tmp_path: 
     np.testing.assert_allclose(scene["sheet"]["size"], turned.size[::-1], rtol=1e-3)
     assert (np.sort(turned.size)[::-1] >= np.sort(extent)[::-1]).all()
     assert (np.array(scene["sheet"]["size"]) / (np.array(scene["sheet"]["points"]) - 1) <= 0.004 / 4).all()
-    for name in ("scene.yaml", "pictures/stiffness.png", "pictures/tissue.png"):
+    for name in ("scene.yaml", *PICTURES):
         (tmp_path / name).parent.mkdir(exist_ok=True)
         (tmp_path / name).write_bytes((mapped / name).read_bytes())
     record = run(load_scene(tmp_path / "scene.yaml"), tmp_path / "run", threads=device.threads, estimate_error=False)
