@@ -12,6 +12,7 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 
 import numpy as np
+from numpy.typing import NDArray
 from PIL import Image
 from scipy.cluster.vq import kmeans2
 from scipy.spatial.distance import cdist
@@ -50,9 +51,8 @@ def deepest_rows(presses: Presses, radius: float) -> float:
     first = np.concatenate([[0], np.cumsum(presses.rows[:-1])]).astype(int)
     is_deep = np.zeros(len(presses.depth), bool)
     is_deep[order] = np.arange(len(order)) - first[presses.index[order]] < DEEPEST
-    shallow = Presses(
-        presses.places, presses.position, *(each[~is_deep] for each in (presses.index, presses.depth, presses.force))
-    )
+    index, depth, force = presses.index[~is_deep], presses.depth[~is_deep], presses.force[~is_deep]
+    shallow = Presses(presses.places, presses.position, index, depth, force)
     fit = fit_presses(shallow, radius)
     index = presses.index[is_deep]
     predicted = fit.stiffness[index] * fit.law.force(presses.depth[is_deep] + fit.offset[index])
@@ -60,7 +60,7 @@ def deepest_rows(presses: Presses, radius: float) -> float:
     return float(np.median(np.sqrt(np.bincount(index, error**2) / DEEPEST)))
 
 
-def explained(places: Array, logs: Array, labels: Array) -> float:
+def explained(places: Array, logs: Array, labels: NDArray[np.integer]) -> float:
     """Return R^2 of the map of log K over presses that are left out by their labels."""
     predicted, constant = np.empty((2, len(logs)))
     for label in np.unique(labels):
@@ -85,8 +85,8 @@ def repeatability(first: Palpation, second: Palpation, reach: float = 2e-3) -> t
     """Return the correlation of the maps of two runs at the presses of the second near those of the first."""
     near = cdist(second.presses.position, first.presses.position).min(axis=1) < reach
     at = second.presses.position[near]
-    maps = [np.log(each.map.stiffness(at)[0]) for each in (first, second)]
-    return float(np.corrcoef(*maps)[0, 1]), int(near.sum())
+    one, other = (np.log(each.map.stiffness(at)[0]) for each in (first, second))
+    return float(np.corrcoef(one, other)[0, 1]), int(near.sum())
 
 
 def interval(values: list[float]) -> str:

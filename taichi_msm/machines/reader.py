@@ -298,7 +298,7 @@ def _select_columns(grid: Grid, block: _Block, chosen: dict[str, str]) -> tuple[
             fault = f"{repeated} columns of this name; rename or delete all but one"
             raise SceneError([f"{grid.place(header, best.index)}: {best.title}: {fault}"])
         if best.index in grid.merged_columns(header):
-            raise SceneError([_describe_merged(grid, header, best.index)])
+            raise SceneError([describe_merged(grid, header, best.index)])
         unit = grid.cell(block.units, best.index)
         title_scale, scale = split_title(best.title, quantity)[1], unit_factor(quantity, unit)
         if given is None and unit and title_scale not in (None, scale):
@@ -320,7 +320,7 @@ def _missing_header(grid: Grid, chosen: dict[str, str]) -> str:
     named = [{quantity for quantity, columns in _find_candidates(row, chosen).items() if columns} for row in cells]
     best = max(range(len(named)), key=lambda row: len(named[row]))
     if named[best] and (merged := grid.merged_columns(best)):
-        return _describe_merged(grid, best, min(merged))
+        return describe_merged(grid, best, min(merged))
     shown = f"{grid.place(best)}: {', '.join(grid.rows[best])[:100]!r}"
     missing = [quantity for quantity in WORDS if quantity not in named[best]]
     if not missing:
@@ -333,7 +333,8 @@ def _missing_header(grid: Grid, chosen: dict[str, str]) -> str:
     return f"{shown} names no {repr(chosen[quantity]) if quantity in chosen else quantity}; {remedy}"
 
 
-def _describe_merged(grid: Grid, row: int, column: int) -> str:
+def describe_merged(grid: Grid, row: int, column: int) -> str:
+    """Describe the fault of a title that is merged with its right neighbour."""
     fault = "merged with the cell to its right; unmerge them and name each column"
     return f"{grid.place(row, column)}: {grid.rows[row][column]}: {fault}"
 

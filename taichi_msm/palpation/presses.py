@@ -69,7 +69,7 @@ class Presses:
 
     def sum(self, values: Array) -> Array:
         """Sum values of rows, shape (N,), over each press."""
-        return np.bincount(self.index, values, minlength=self.count)
+        return np.bincount(self.index, values, minlength=self.count).astype(np.float64)
 
     def root_mean_square(self, values: Array) -> Array:
         """Return the root mean square of values of rows, shape (N,), of each press."""

@@ -51,4 +51,5 @@ def score(presses: Presses, fit: PressFit, progress: ProgressCallback) -> Scores
             residuals[k, left_out] = relative_residual(new, np.exp(log)[new.index] * shape)
         residuals[2, left_out] = relative_residual(new, predicted.force)
     coverage = float(np.mean((forces[1] <= presses.force) & (presses.force <= forces[2])))
-    return Scores(*residuals, Forces(*forces), coverage)
+    constant, nearest, by_map = residuals
+    return Scores(constant, nearest, by_map, Forces(*forces), coverage)

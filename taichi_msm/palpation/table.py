@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from taichi_msm.arithmetic import Array
 from taichi_msm.errors import SceneError
 from taichi_msm.machines.cells import WORKBOOK_SUFFIX, Grid, Row, read_text
-from taichi_msm.machines.reader import VALUE_START, choose_sheet, parse_choices
+from taichi_msm.machines.reader import VALUE_START, choose_sheet, describe_merged, parse_choices
 from taichi_msm.machines.titles import UNITS, fold, split_choice, split_title, unit_factor
 from taichi_msm.machines.workbook import read_workbook
 
@@ -138,12 +138,12 @@ def _select_columns(grid: Grid, header: int, chosen: dict[str, str], *, with_for
             fault = f"{len(found[quantity])} columns are {quantity}"
             raise SceneError([f"{where}: {fault}; delete or rename all but one, or choose one by {option}"])
         if n in grid.merged_columns(header):
-            raise SceneError([f"{where}: merged with the cell to its right; unmerge them and name each column"])
-        scale: float | None = 1.0
+            raise SceneError([describe_merged(grid, header, n)])
+        scale = 1.0
         if kind:
-            given = split_choice(chosen.get(quantity, ""), kind)[1]
-            scale = given or unit_factor(kind, grid.cell(first, n)) or split_title(titles[n], kind)[1]
-            if scale is None:
+            given, of_title = split_choice(chosen.get(quantity, ""), kind)[1], split_title(titles[n], kind)[1]
+            scale = given or unit_factor(kind, grid.cell(first, n)) or of_title or 0.0
+            if not scale:
                 fault = f"no unit of {quantity} ({', '.join(UNITS[kind])})"
                 raise SceneError([f'{where}: {fault}; give it by --columns "{quantity}={titles[n]}, UNIT"'])
         columns[quantity] = _Column(n, titles[n], scale)

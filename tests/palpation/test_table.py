@@ -37,9 +37,9 @@ def read(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Read:
     """Read a text as a table."""
     monkeypatch.chdir(tmp_path)
 
-    def read_text(text: str, *columns: str, **options: bool) -> Table:
+    def read_text(text: str, *columns: str, with_force: bool = True) -> Table:
         Path("table.csv").write_text(text, encoding="utf-8")
-        return read_table("table.csv", columns, **options)
+        return read_table("table.csv", columns, with_force=with_force)
 
     return read_text
 
