@@ -14,7 +14,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
@@ -25,11 +25,12 @@ from taichi_msm.errors import ProgressCallback
 from taichi_msm.palpation.law import BallLaw
 from taichi_msm.palpation.presses import Presses
 
-# Gain of log likelihood at the ends of a 95 % interval.
-MIN_GAIN = 1.92
+# Ends of a 95 % interval: gain of log likelihood, and distance in standard deviations.
+MIN_GAIN, DEVIATIONS = 1.92, 1.96
 
-# Locks that are compared, in units of the greatest depth; the tangent of a greater one grows by less than 5 %.
-LOCKS = np.geomspace(40, 0.5, 18)
+# Locks that are compared, in units of the greatest depth: with a greater one the tangent grows by less than 5 %, with a
+# smaller one the foundation is locked, and linear again, over most of the depth.
+LOCKS = np.geomspace(40, 0.7, 18)
 
 # First offsets that are compared, in units of the greatest depth of a press.
 FIRST_OFFSETS = np.linspace(-0.5, 1.0, 16)
@@ -114,6 +115,13 @@ def lock_interval(presses: Presses, best: PressFit) -> tuple[float, float | None
     return low, end(1.1)
 
 
+def with_lock_error(presses: Presses, fit: PressFit, interval: tuple[float, float | None]) -> PressFit:
+    """Return a fit whose errors of log K include that of the lock, by the fits at the ends of its 95 % interval."""
+    ends = [at_lock(presses, fit, lock).stiffness for lock in interval if lock is not None]
+    sides = np.abs(np.log(np.array(ends) / fit.stiffness)) / DEVIATIONS
+    return replace(fit, error=np.hypot(fit.error, sides.mean(axis=0)))
+
+
 def at_lock(presses: Presses, start: PressFit, lock: float) -> PressFit:
     """Return the fit for a lock [m], from another one."""
     return fit_offsets(presses, BallLaw(start.law.radius, lock), start)
@@ -133,12 +141,14 @@ def fit_offsets(presses: Presses, law: BallLaw, start: PressFit | None = None) -
         last = likelihood
     scale, residual, information, _, ratio = model.linearise(offset)
     at_mean, _ = model.profile(np.full(presses.count, prior.mean))
-    # log K is correlated with o: their covariance has a variance of o of s^2 / (i + s^2 / t^2).
-    strength = presses.sum((presses.target - residual) ** 2)
-    variance = 1 / strength + ratio**2 / (information + (prior.noise / prior.width) ** 2)
-    rms = presses.root_mean_square(residual)
-    peak = presses.peak
-    error = prior.noise * np.sqrt(variance)
+    # The errors of log K are those of the rows, of its offset, and of the mean offset, which all presses share.
+    weight = (prior.noise / prior.width) ** 2
+    of_rows = prior.noise**2 / presses.sum((presses.target - residual) ** 2)
+    of_offset = prior.noise**2 / (information + weight)
+    of_mean = 1 / float((1 / (prior.width**2 + prior.noise**2 / np.maximum(information, 1e-300))).sum())
+    share = weight / (information + weight)
+    error = np.sqrt(of_rows + ratio**2 * (of_offset + share**2 * of_mean))
+    rms, peak = presses.root_mean_square(residual), presses.peak
     return PressFit(law, prior, offset, scale * peak, error, at_mean * peak, rms, likelihood)
 
 

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from taichi_msm.errors import StageProgressCallback, writing
-from taichi_msm.palpation.fit import fit_presses, lock_interval
+from taichi_msm.palpation.fit import fit_presses, lock_interval, with_lock_error
 from taichi_msm.palpation.predict import build_map
 from taichi_msm.palpation.presses import choose_presses, presses_to_predict
 from taichi_msm.palpation.report import publication, write_report
@@ -32,10 +32,13 @@ def palpate(
     presses, left_out = choose_presses(read)
     with writing(directory), publication(directory) as published:
         fit = fit_presses(presses, radius, lambda done, total: progress("fit", done, total))
-        interval = None if math.isinf(fit.law.lock) else lock_interval(presses, fit)
+        interval = None
+        if not math.isinf(fit.law.lock):
+            interval = lock_interval(presses, fit)
+            fit = with_lock_error(presses, fit, interval)
         progress("map", 0, 0)
         built = build_map(presses, fit)
-        scores = score(presses, fit, lambda done, total: progress("leave out", done, total))
+        scores = score(presses, fit, lambda done, total: progress("scores", done, total))
         predicted, notes = None, [*read.notes]
         if to_predict is not None:
             others = presses_to_predict(to_predict)

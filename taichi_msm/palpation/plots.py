@@ -22,7 +22,7 @@ from taichi_msm.palpation.result import Palpation
 from taichi_msm.plot_style import BLUE, DPI, INK, SKY, STYLE, TWO_COLUMN_WIDTH, VERMILION
 
 # Pixels along the longer side of a map.
-PIXELS = 200
+PIXELS = 120
 
 # Colour of tissue that is farther than a length from every press.
 UNKNOWN = "#D0D0D0"

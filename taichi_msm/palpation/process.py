@@ -10,7 +10,7 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.linalg import LinAlgError, cho_factor, cho_solve
+from scipy.linalg import LinAlgError, cho_factor, cho_solve, solve_triangular
 from scipy.optimize import minimize
 from scipy.spatial.distance import cdist
 
@@ -56,7 +56,7 @@ class Process:
 
     def _predict(self, places: Array) -> tuple[Array, Array]:
         covariance = (1 - self.share) * correlation(places, self.places, self.length)
-        known = (covariance * cho_solve((self.factor, True), covariance.T).T).sum(axis=1)
+        known = (solve_triangular(self.factor, covariance.T, lower=True, check_finite=False) ** 2).sum(axis=0)
         # The last term is the error of the mean.
         of_mean = (1 - covariance @ self.unit_weights) ** 2 / self.unit_weights.sum()
         variance = self.variance * np.maximum(1 - self.share - known + of_mean, 0.0)

@@ -11,12 +11,12 @@ from typing import Any
 
 import numpy as np
 import yaml
+from numpy.typing import NDArray
 from PIL import Image
 
 from taichi_msm.arithmetic import Array
 from taichi_msm.errors import printable
 from taichi_msm.palpation.plane import Plane, find_plane
-from taichi_msm.palpation.predict import StiffnessMap
 from taichi_msm.palpation.result import Palpation
 from taichi_msm.runs.directory import create_file, write_new_file
 from taichi_msm.scene.section import MAX_POINTS
@@ -49,13 +49,12 @@ def write_scene(folder: Path, result: Palpation) -> str:
     if max(rows, cols) > MAX_POINTS:
         fault = f"places over {max(plane.size):.3g} m need {rows} x {cols} mass points for a ball of {law.radius:g} m"
         return f"{SCENE} is left out: {fault}; is the unit of x, y and z right?"
-    stiffness, _, _ = built.stiffness(plane.pixels(rows, cols).reshape(-1, 3))
-    stiffness = stiffness.reshape(rows, cols)
+    stiffness = built.stiffness(plane.pixels(rows, cols).reshape(-1, 3))[0].reshape(rows, cols)
     median = float(np.median(built.fit.mean_stiffness))
     low, high = float(stiffness.min()) / median, float(stiffness.max()) / median * (1 + 1e-6)
     (folder / STIFFNESS).parent.mkdir()
     _write_png(folder / STIFFNESS, ((stiffness / median - low) / (high - low) * 65535).round().astype(np.uint16))
-    _write_png(folder / TISSUE, _colour(plane, built))
+    _write_png(folder / TISSUE, _colour(np.log(stiffness), _picture_size(plane)))
     pressed = int(np.argsort(built.fit.mean_stiffness)[presses.count // 2])
     depth = float(presses.greatest_depth[pressed]) + prior.mean
     across, down = plane.fractions(presses.position[pressed])
@@ -100,15 +99,15 @@ def write_scene(folder: Path, result: Palpation) -> str:
     return ""
 
 
-def _colour(plane: Plane, built: StiffnessMap) -> Array:
-    """Return the map of log K as colours, shape (height, width, 3)."""
-    cols, rows = _picture_size(plane)
-    stiffness, _, _ = built.stiffness(plane.pixels(rows, cols).reshape(-1, 3))
-    logs = np.log(stiffness)
-    share = (logs - logs.min()) / max(np.ptp(logs), 1e-12)
+def _colour(values: Array, size: list[int]) -> NDArray[np.uint8]:
+    """Return values as a picture of colours, of a width and a height [px]."""
+    share = (values - values.min()) / max(float(np.ptp(values)), 1e-12)
+    enlarged = np.asarray(
+        Image.fromarray(share.astype(np.float32)).resize((size[0], size[1]), Image.Resampling.BICUBIC)
+    )
     at = np.linspace(0, 1, len(COLOURS))
-    colours = np.column_stack([np.interp(share, at, COLOURS[:, k]) for k in range(3)])
-    return colours.reshape(rows, cols, 3).round().astype(np.uint8)
+    colours = np.stack([np.interp(enlarged, at, COLOURS[:, k]) for k in range(3)], axis=-1)
+    return np.asarray(colours.round(), np.uint8)
 
 
 def _picture_size(plane: Plane) -> list[int]:
@@ -116,6 +115,6 @@ def _picture_size(plane: Plane) -> list[int]:
     return [2 * max(1, round(PIXELS / 2 * side / max(plane.size))) for side in plane.size]
 
 
-def _write_png(path: Path, pixels: Array) -> None:
+def _write_png(path: Path, pixels: NDArray[np.unsignedinteger]) -> None:
     with create_file(path) as file:
         Image.fromarray(pixels).save(file, "PNG")

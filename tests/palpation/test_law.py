@@ -81,6 +81,6 @@ def test_rough_press_of_the_program(device: Device, tmp_path: Path) -> None:
     last = (tmp_path / "run" / "forces.csv").read_text().splitlines()[-1]
     expected = stiffness * float(BallLaw(RADIUS, lock).force(np.array([depth]))[0])
     # Mass points are squares of side h = R / 27. The pressure is 0 at the border of the contact, so the error of the
-    # sum over squares is of second order: h^2 / 12 times the curvature of the dent over its depth, 1 / (R depth) in each
-    # direction, 3.7e-4, and some more where the foundation locks.
+    # sum over squares is of second order: h^2 / 12 times the curvature of the dent over its depth, 1 / (R depth) each
+    # way, 3.7e-4, and some more where the foundation locks.
     assert -float(last.split(",")[-1]) == pytest.approx(expected, rel=1e-3)
