@@ -17,7 +17,7 @@ from scipy.spatial.distance import cdist
 from taichi_msm.arithmetic import Array
 
 # Number of places that the likelihood is computed from, a random part of more.
-MAX_PLACES = 1000
+MAX_PLACES = 700
 
 # Lengths, in units of the extent of the places, and shares of the noise in the variance: first ones, and bounds.
 FIRST_LENGTHS, FIRST_SHARES = (0.05, 0.15, 0.5), (0.1, 0.5, 0.9)

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from taichi_msm.arithmetic import Array
 from taichi_msm.errors import SceneError
-from taichi_msm.machines.cells import WORKBOOK_SUFFIX, Grid, Row, read_text
+from taichi_msm.machines.cells import LETTER, WORKBOOK_SUFFIX, Grid, Row, read_text
 from taichi_msm.machines.reader import VALUE_START, choose_sheet, describe_merged, parse_choices
 from taichi_msm.machines.titles import UNITS, fold, split_choice, split_title, unit_factor
 from taichi_msm.machines.workbook import read_workbook
@@ -95,6 +95,9 @@ def read_table(name: str, choices: Sequence[str] = (), sheet: str | None = None,
 
 
 def _is_header(row: Row, chosen: dict[str, str]) -> bool:
+    # Most rows are numbers, which are no titles.
+    if sum(bool(LETTER.search(cell)) for cell in row) < MIN_TITLES:
+        return False
     return sum(map(bool, _find_columns(row, chosen).values())) >= MIN_TITLES
 
 

@@ -7,7 +7,7 @@ import math
 import numpy as np
 import pytest
 
-from taichi_msm.palpation.fit import MIN_GAIN, PressFit, at_lock, fit_presses, lock_interval
+from taichi_msm.palpation.fit import MIN_GAIN, PressFit, at_lock, fit_presses, lock_interval, with_lock_error
 from taichi_msm.palpation.predict import build_map
 from taichi_msm.palpation.process import correlation, fit_process
 from taichi_msm.palpation.scores import score
@@ -65,10 +65,24 @@ def test_lock_and_prior_are_recovered(truth: Truth, fitted: PressFit) -> None:
 
 
 def test_intervals_of_the_stiffness_cover_the_truth(truth: Truth, fitted: PressFit) -> None:
-    distance = np.abs(np.log(fitted.stiffness / truth.stiffness)) / fitted.error
+    error = with_lock_error(truth.presses, fitted, lock_interval(truth.presses, fitted)).error
+    distance = np.abs(np.log(fitted.stiffness / truth.stiffness)) / error
     assert_covered(float(np.mean(distance < 1.96)), 0.95, COUNT)
     # The prior improves the offsets.
     assert np.std(fitted.offset - truth.offset) < OFFSET_WIDTH
+
+
+def test_errors_include_those_of_shared_parameters() -> None:
+    """All presses of a small table share the errors of lock and mean offset, about half of their own."""
+    means = []
+    for seed in range(12):
+        small = make_presses(40, seed=200 + seed)
+        fit = fit_presses(small.presses, RADIUS)
+        error = with_lock_error(small.presses, fit, lock_interval(small.presses, fit)).error
+        means.append(float(np.mean(np.log(fit.stiffness / small.stiffness) / error)))
+    # The mean over the presses of a table is normal with a standard deviation below 1, which the shared part would
+    # reach alone; without it in the errors, this is 1.0 +- 0.2.
+    assert np.sqrt(np.mean(np.square(means))) < 0.8
 
 
 @pytest.mark.parametrize("seed", range(3))
