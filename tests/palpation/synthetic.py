@@ -29,12 +29,20 @@ def log_stiffness(position: Array) -> Array:
     return np.asarray(np.log(3e6) + 0.4 * np.sin(150 * position[:, 0]) * np.cos(120 * position[:, 1]))
 
 
-def make_presses(count: int, *, lock: float = LOCK, noise: float = 0.02, scatter: float = 0.05, seed: int = 1) -> Truth:
-    """Presses of ten rows; `noise`: standard deviation of forces over the peak; `scatter`: of log K about the map."""
+def make_presses(
+    count: int,
+    *,
+    lock: float = LOCK,
+    noise: float = 0.02,
+    scatter: float = 0.05,
+    width: float = OFFSET_WIDTH,
+    seed: int = 1,
+) -> Truth:
+    """Presses of ten rows; standard deviations: `noise` of forces over the peak, `scatter` of log K about the map."""
     rng, rows = np.random.default_rng(seed), 10
     position = np.column_stack([rng.uniform(0, 0.06, count), rng.uniform(0, 0.04, count), np.zeros(count)])
     stiffness = np.exp(log_stiffness(position) + scatter * rng.standard_normal(count))
-    offset = MEAN_OFFSET + OFFSET_WIDTH * rng.standard_normal(count)
+    offset = MEAN_OFFSET + width * rng.standard_normal(count)
     index, depth = np.repeat(np.arange(count), rows), np.tile(np.linspace(5e-5, 3e-3, rows), count)
     force = stiffness[index] * BallLaw(RADIUS, lock).force(depth + offset[index])
     peak = force.reshape(count, rows).max(axis=1)[index]
