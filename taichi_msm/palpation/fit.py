@@ -141,6 +141,8 @@ def fit_offsets(presses: Presses, law: BallLaw, start: PressFit | None = None) -
         last = likelihood
     scale, residual, information, _, ratio = model.linearise(offset)
     at_mean, _ = model.profile(np.full(presses.count, prior.mean))
+    # At the mean offset, a shallow press may not touch.
+    at_mean = np.where(at_mean > 0, at_mean, scale)
     # The errors of log K are those of the rows, of its offset, and of the mean offset, which all presses share.
     weight = (prior.noise / prior.width) ** 2
     of_rows = prior.noise**2 / presses.sum((presses.target - residual) ** 2)

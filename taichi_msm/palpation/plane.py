@@ -12,6 +12,9 @@ from taichi_msm.arithmetic import Array
 # Number of places from which the height of the tissue is interpolated.
 NEIGHBOURS = 8
 
+# Least width of places in a plane over their length.
+MIN_WIDTH_SHARE = 1e-3
+
 
 @dataclass(frozen=True, eq=False)
 class Plane:
@@ -49,7 +52,10 @@ class Plane:
 def find_plane(places: Array, normal: Array, margin: float) -> Plane:
     """Return the plane of places, with a margin around them [m]; `normal`: direction out of the tissue."""
     origin = places.mean(axis=0)
-    x, _, z = np.linalg.svd(places - origin, full_matrices=True)[2]
+    _, extents, (x, _, z) = np.linalg.svd(places - origin)
+    if extents[1] < MIN_WIDTH_SHARE * extents[0]:  # places on a line are in any plane through it
+        z = normal - (normal @ x) * x
+        z /= np.linalg.norm(z)
     x, z = x * _sign(x[np.abs(x).argmax()]), z * _sign(z @ normal)
     axes = np.array([x, np.cross(z, x), z])
     inside = (places - origin) @ axes.T

@@ -65,7 +65,9 @@ def build_map(presses: Presses, fit: PressFit) -> StiffnessMap:
     """Return the map of fitted presses."""
     depth = presses.depth + fit.prior.mean
     force, slope = fit.law.force(depth), fit.law.slope(depth)
-    effect = float(np.mean(presses.sum(force * slope) / presses.sum(force**2)))
+    squares = presses.sum(force**2)
+    touches = squares > 0
+    effect = float(np.mean(presses.sum(force * slope)[touches] / squares[touches]))
     return StiffnessMap(fit, fit_process(presses.position, np.log(fit.mean_stiffness)), effect)
 
 

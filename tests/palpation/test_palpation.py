@@ -160,6 +160,19 @@ def test_plane_keeps_the_side_and_the_handedness() -> None:
     np.testing.assert_allclose(plane.fractions(plane.pixels(10, 20)[3, 7]), [7.5 / 20, 3.5 / 10])
 
 
+def test_places_on_a_line(truth: Truth, tmp_path: Path, program: Program) -> None:
+    position = truth.presses.position[:15] * [1, 0, 0] + [0, 0.1, 0.2]
+    table = write_table(tmp_path / "liver.csv", replace(truth.presses.subset(np.arange(15)), position=position))
+    done = program("palpation", str(table), "--radius", "4mm", "--out", str(tmp_path / "map"))
+    assert done.returncode == 0, done.stderr
+    height, width = load_scene(tmp_path / "map" / "scene.yaml").sheet.size
+    # Two radii on each side.
+    assert height == pytest.approx(0.016)
+    assert width == pytest.approx(0.016 + np.ptp(position[:, 0]), abs=1e-6)
+    plane = find_plane(position, np.array([0, 0, 1.0]), 0.008)
+    np.testing.assert_allclose(plane.axes, np.eye(3), atol=1e-9)
+
+
 def test_linear_tissue(tmp_path: Path, program: Program, message: Messages) -> None:
     table = write_table(tmp_path / "silicone.csv", make_presses(30, lock=math.inf).presses)
     done = program("palpation", str(table), "--radius", "0.004", "--out", str(tmp_path / "map"))
