@@ -122,7 +122,8 @@ def _select_columns(grid: Grid, header: int, chosen: dict[str, str], *, with_for
     """Return the columns that are read; raise a SceneError for missing ones, and those without a unit."""
     titles, found = grid.rows[header], _find_columns(grid.rows[header], chosen)
     first = next((n for n in range(header + 1, len(grid.rows)) if grid.has_content(n)), None)
-    forces = COMPONENTS if all(found[name] for name in COMPONENTS) else ("force",)
+    has_vector = all(found[name] for name in COMPONENTS)
+    forces = COMPONENTS if has_vector and "force" not in chosen else ("force",)
     normal = NORMAL if any(found[name] for name in NORMAL) else ()
     needed = [*POSITION, "depth", *((*forces, *normal) if with_force else ())]
     if found["place"] or "place" in chosen:

@@ -94,6 +94,10 @@ def test_chosen_columns(read: Read) -> None:
     assert table.force.max() == pytest.approx(2.1 * 0.9)
 
 
+def test_chosen_force_instead_of_a_vector(read: Read) -> None:
+    assert_is_table(read(f"{HEADER},fx_N,fy_N,fz_N\n{rows(line='p{n},{x},{y},5.0,{d},{f},1,2,3')}", "force=force, N"))
+
+
 def test_workbook(tmp_path: Path) -> None:
     openpyxl = pytest.importorskip("openpyxl")
     book = openpyxl.Workbook()
@@ -168,6 +172,10 @@ def test_tables_of_places_to_predict(read: Read) -> None:
     table = read("x_mm,y_mm,z_mm,depth_mm\n" + rows(line="{x},{y},5.0,{d}"), with_force=False)
     assert len(table.places) == 12
     assert not table.force.any()
+    # Rows of one depth are presses at other places.
+    table = read("x_mm,y_mm,z_mm,depth_mm\n" + rows(line="{x},{y},5.0,{d}", skip=3), with_force=False)
+    assert len(table.places) == 12
+    np.testing.assert_allclose(table.position[:, 0], 1e-3 * np.arange(12), rtol=1e-14)
 
 
 FAULTS = {
