@@ -28,7 +28,7 @@ LAYERS = [
     {"gradients"},
     {"runs"},
     {"datasets", "exports", "machines", "study", "sweeps", "view"},
-    {"fitting"},
+    {"fitting", "palpation"},
     {"cli"},
     {"__main__", "__init__"},
 ]

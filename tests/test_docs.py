@@ -228,7 +228,7 @@ def test_commands_run(pages: list[Path], small_scenes: Path, program: Program) -
         for arguments in commands(page):
             opens_a_window = arguments[0] == "view" and "--record" not in arguments
             needs_a_session = any("session-1" in word for word in arguments)
-            tested_elsewhere = arguments[0] in ("study", "fit") or "--resume" in arguments
+            tested_elsewhere = arguments[0] in ("study", "fit", "palpation") or "--resume" in arguments
             if opens_a_window or needs_a_session or tested_elsewhere or tuple(arguments) in done_before:
                 continue
             done_before.add(tuple(arguments))

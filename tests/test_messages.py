@@ -144,6 +144,7 @@ WITHOUT_MESSAGES = {
     "exports/obj.py",
     "fitting/panels.py",
     "fitting/plots.py",
+    "palpation/plots.py",
     "study/plot.py",
     "view/events.py",
 }

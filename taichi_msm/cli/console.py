@@ -35,6 +35,8 @@ STAGES = {
     "workers": "waiting for a worker of the cluster",
     "runs": "running",
     "fit": "fitting",
+    "map": "mapping",
+    "scores": "predicting presses that are left out",
     "contact": "drawing the contact sheet",
 }
 

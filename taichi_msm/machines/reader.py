@@ -19,6 +19,7 @@ import numpy as np
 from taichi_msm.arithmetic import Array
 from taichi_msm.errors import SceneError, did_you_mean
 from taichi_msm.machines.cells import LETTER, WORKBOOK_SUFFIX, Grid, Row, parse_number, read_text
+from taichi_msm.machines.titles import UNITS, fold, split_choice, split_title, unit_factor
 from taichi_msm.machines.workbook import read_workbook
 
 # Smallest number of rows of a test, and of those that the noise of the force is estimated from.
@@ -29,9 +30,6 @@ TORE = "the tissue tore"
 
 EXPECTED = f"name a table of a testing machine: .csv, .tsv, .txt or {WORKBOOK_SUFFIX}"
 
-# Standard gravity [m/s2], which is also the number of newtons per kilogram-force.
-GRAVITY = 9.80665
-
 # Words for the quantities in titles, and endings of German compounds, such as Prüfzeit, Standardweg, Standardkraft.
 WORDS = {
     "time": {"time", "temps", "zeit"},
@@ -40,23 +38,15 @@ WORDS = {
     "force": {"force", "load", "fz", "kraft"},
 }
 ENDINGS = {"time": "zeit", "depth": "weg", "force": "kraft"}
-# Factors from units to SI units, the usual unit first.
-UNITS = {
-    "time": {"s": 1.0, "ms": 1e-3, "min": 60.0},
-    "depth": {"mm": 1e-3, "m": 1.0, "cm": 1e-2, "um": 1e-6},
-    "force": {"N": 1.0, "mN": 1e-3, "kN": 1e3, "gf": 1e-3 * GRAVITY, "kgf": GRAVITY},
-}
-# Aliases of units, such as sec and g of texture analysers.
-UNIT_ALIASES = {"sec": "s", "g": "gf", "kg": "kgf", "µm": "um", "\N{GREEK SMALL LETTER MU}m": "um"}
 
 # Smallest ranges of a test, in SI units.
 MIN_RANGES = {"time": (1e-9, "s"), "depth": (1e-12, "m"), "force": (1e-15, "N")}
 
+# Content of a table, for messages.
+CONTENT = "time, depth and force"
+
 # Longest title [characters].
 MAX_TITLE_LENGTH = 200
-
-# Reversed title with a unit: Time, s; Fz [gf]; Force (mN); Weg / mm; Force_N; Kraft in N.
-REVERSED_UNIT = re.compile(r"[\])]?([^\s,/_\[\]()]+)(?:\s+ni(?=[\s,/_\[(]))?[\s,/_\[(]+(.*)")
 
 # Words, and parts of a title in brackets.
 WORD, BRACKETS = re.compile(r"[^\W\d_]+"), re.compile(r"[(\[][^)\]]*[)\]]")
@@ -109,11 +99,11 @@ def read_machine_test(
     Selected columns are such as "depth=Traverse, mm", by default with the unit of the file; blocks are counted from 1.
     A single sheet or block with a table needs no selection.
     """
-    name, chosen = str(path), _parse_choices(columns)
+    name, chosen = str(path), parse_choices(columns)
     if name.lower().endswith(WORKBOOK_SUFFIX):
         sheets = read_workbook(name, EXPECTED)
         tables = [title for title, each in sheets.items() if _find_blocks(each, chosen)]
-        grid = _choose_sheet(name, sheets, sheet, tables)
+        grid = choose_sheet(name, sheets, sheet, tables)
     elif sheet is None:
         grid = read_text(name, lambda row: _is_header(row, chosen), EXPECTED)
     else:
@@ -123,8 +113,8 @@ def read_machine_test(
     if not blocks:
         raise SceneError([_missing_header(grid, chosen)])
     if block is None and len(blocks) > 1:
-        listed = _listed([f"{n} (rows {part.header + 1} to {part.end})" for n, part in enumerate(blocks, 1)])
-        raise SceneError([f"{grid.title}: {len(blocks)} blocks of rows; choose one by --block: {listed}"])
+        numbered = listed([f"{n} (rows {part.header + 1} to {part.end})" for n, part in enumerate(blocks, 1)])
+        raise SceneError([f"{grid.title}: {len(blocks)} blocks of rows; choose one by --block: {numbered}"])
     if block is not None and not 1 <= block <= len(blocks):
         raise SceneError([f"--block {block}: {grid.title} has {len(blocks)}, numbered from 1"])
     test = _read_block(grid, blocks[(block or 1) - 1], chosen)
@@ -159,13 +149,14 @@ def _orient(test: MachineTest) -> MachineTest:
     return replace(test, notes=(*test.notes, note))
 
 
-def _parse_choices(columns: Sequence[str]) -> dict[str, str]:
+def parse_choices(columns: Sequence[str], quantities: Sequence[str] = tuple(WORDS)) -> dict[str, str]:
     """Parse chosen columns, such as "depth=Traverse, mm", into titles by quantity."""
     chosen: dict[str, str] = {}
     for text in columns:
         quantity, _, title = (part.strip() for part in text.partition("="))
-        if quantity not in WORDS or not title:
-            expected = 'take time, depth or force, and the title of its column, such as "depth=Traverse, mm"'
+        if quantity not in quantities or not title:
+            names = f"{', '.join(quantities[:-1])} or {quantities[-1]}"
+            expected = f'take {names}, and the title of its column, such as "depth=Traverse, mm"'
             raise SceneError([f'--columns "{text}": {expected}'])
         if quantity in chosen:
             raise SceneError([f'--columns "{text}": {quantity} is chosen twice; leave one'])
@@ -173,23 +164,26 @@ def _parse_choices(columns: Sequence[str]) -> dict[str, str]:
     return chosen
 
 
-def _choose_sheet(name: str, sheets: dict[str, Grid], chosen: str | None, tables: list[str]) -> Grid:
+def choose_sheet(
+    name: str, sheets: dict[str, Grid], chosen: str | None, tables: list[str], content: str = CONTENT
+) -> Grid:
     """Return the selected sheet of a workbook, or the only one with a table; `tables`: names of those with one."""
     if chosen is None:
         if len(tables) > 1:
-            raise SceneError([f"{name}: {len(tables)} sheets with a table; choose one by --sheet: {_listed(tables)}"])
+            raise SceneError([f"{name}: {len(tables)} sheets with a table; choose one by --sheet: {listed(tables)}"])
         if not tables and len(sheets) != 1:
-            remedy = f"choose one by --sheet: {_listed(list(sheets))}" if sheets else "save one with cells"
-            raise SceneError([f"{name}: no sheet has a table of time, depth and force; {remedy}"])
+            remedy = f"choose one by --sheet: {listed(list(sheets))}" if sheets else "save one with cells"
+            raise SceneError([f"{name}: no sheet has a table of {content}; {remedy}"])
         chosen = next(iter(tables or sheets))
     for title, grid in sheets.items():
         if title.casefold() == chosen.casefold():
             return grid
-    listed = _listed(tables or list(sheets))
-    raise SceneError([f"--sheet {chosen}: not in {name}{did_you_mean(chosen, sheets)}; it has {listed}"])
+    raise SceneError(
+        [f"--sheet {chosen}: not in {name}{did_you_mean(chosen, sheets)}; it has {listed(tables or list(sheets))}"]
+    )
 
 
-def _listed(names: Sequence[str]) -> str:
+def listed(names: Sequence[str]) -> str:
     """List at most 50 names."""
     more = [f"and {len(names) - 50} more"] if len(names) > 50 else []
     return ", ".join([*(name[:MAX_TITLE_LENGTH] for name in names[:50]), *more])
@@ -204,7 +198,7 @@ def _find_blocks(grid: Grid, chosen: dict[str, str], min_rows: int = MIN_ROWS) -
         candidates = _find_candidates(grid.rows[header], chosen)
         first = rows[0] if rows else None
         pairs = ((quantity, index) for quantity, columns in candidates.items() for index in columns)
-        has_units = any(_unit_factor(quantity, grid.cell(first, index)) is not None for quantity, index in pairs)
+        has_units = any(unit_factor(quantity, grid.cell(first, index)) is not None for quantity, index in pairs)
         units, rows = (first, rows[1:]) if has_units else (None, rows)
         counts = [sum(parse_number(cell) is not None for cell in grid.rows[n]) for n in rows]
         if sum(count >= len(WORDS) for count in counts) >= min_rows:
@@ -224,10 +218,10 @@ def _find_candidates(row: Row, chosen: dict[str, str]) -> dict[str, list[int]]:
     candidates = {}
     for quantity, title in chosen.items():
         # Columns of the whole title, or else of its name without the unit.
-        name = _fold(_split_choice(title, quantity)[0])
-        same = [n for n, cell in enumerate(row) if _fold(cell) == _fold(title)]
+        name = fold(split_choice(title, quantity)[0])
+        same = [n for n, cell in enumerate(row) if fold(cell) == fold(title)]
         candidates[quantity] = same or [
-            n for n, cell in enumerate(row) if name in (_fold(cell), _fold(_split_title(cell, quantity)[0]))
+            n for n, cell in enumerate(row) if name in (fold(cell), fold(split_title(cell, quantity)[0]))
         ]
     taken = {column for columns in candidates.values() for column in columns}
     titles = [n for n, cell in enumerate(row) if n not in taken and 0 < len(cell) <= MAX_TITLE_LENGTH]
@@ -244,35 +238,6 @@ def _named_quantities(title: str) -> frozenset[str]:
     words = WORD.findall((BRACKETS.sub(" ", title[:end]) + title[end:]).casefold())
     by_ending = {quantity for quantity, ending in ENDINGS.items() if any(word.endswith(ending) for word in words)}
     return frozenset(by_ending | {quantity for quantity, known in WORDS.items() if known & {*words}})
-
-
-def _fold(text: str) -> str:
-    """Normalise case and spaces."""
-    return " ".join(text.split()).casefold()
-
-
-def _unit_factor(quantity: str, unit: str) -> float | None:
-    """Return the factor from a unit to SI; None if it is not a unit of the quantity."""
-    unit, known = unit.strip("[]() "), UNITS[quantity]
-    # In lower case, meganewtons (MN) would be millinewtons.
-    if unit in known or unit == "MN":
-        return known.get(unit)
-    lower = {name.casefold(): scale for name, scale in known.items()}
-    return lower.get(UNIT_ALIASES.get(unit.casefold(), unit.casefold()))
-
-
-def _split_title(title: str, quantity: str) -> tuple[str, float | None]:
-    """Split a title into its name and the factor of its unit; None without a unit of the quantity."""
-    match_ = REVERSED_UNIT.fullmatch(title[::-1])
-    scale = _unit_factor(quantity, match_[1][::-1]) if match_ else None
-    return (match_[2][::-1], scale) if match_ and scale is not None else (title, None)
-
-
-def _split_choice(title: str, quantity: str) -> tuple[str, float | None]:
-    """Split a selected title, as `_split_title` does, but only at its last comma."""
-    name, _, unit = (part.strip() for part in title.rpartition(","))
-    scale = _unit_factor(quantity, unit)
-    return (name, scale) if name and scale is not None else (title, None)
 
 
 def _read_block(grid: Grid, block: _Block, chosen: dict[str, str]) -> MachineTest:
@@ -312,11 +277,11 @@ def _select_columns(grid: Grid, block: _Block, chosen: dict[str, str]) -> tuple[
 
     selected, notes = [], []
     for quantity, candidates in _find_candidates(titles, chosen).items():
-        given, columns = _split_choice(chosen.get(quantity, ""), quantity)[1], []
+        given, columns = split_choice(chosen.get(quantity, ""), quantity)[1], []
         for index in candidates:
-            scale = _unit_factor(quantity, grid.cell(block.units, index))
+            scale = unit_factor(quantity, grid.cell(block.units, index))
             if scale is None:
-                scale = _split_title(titles[index], quantity)[1]
+                scale = split_title(titles[index], quantity)[1]
             if given is not None and scale not in (None, given):
                 title = chosen[quantity]
                 notes.append(f"{grid.title}: {quantity} is read as {title!r}, although the file has another unit")
@@ -333,9 +298,9 @@ def _select_columns(grid: Grid, block: _Block, chosen: dict[str, str]) -> tuple[
             fault = f"{repeated} columns of this name; rename or delete all but one"
             raise SceneError([f"{grid.place(header, best.index)}: {best.title}: {fault}"])
         if best.index in grid.merged_columns(header):
-            raise SceneError([_describe_merged(grid, header, best.index)])
+            raise SceneError([describe_merged(grid, header, best.index)])
         unit = grid.cell(block.units, best.index)
-        title_scale, scale = _split_title(best.title, quantity)[1], _unit_factor(quantity, unit)
+        title_scale, scale = split_title(best.title, quantity)[1], unit_factor(quantity, unit)
         if given is None and unit and title_scale not in (None, scale):
             reason = f"not a unit of {quantity}; so it is in that of its title" if scale is None else "its unit"
             notes.append(f"{grid.title}: {best.title!r}: {unit[:40]!r} in the row below is {reason}")
@@ -355,7 +320,7 @@ def _missing_header(grid: Grid, chosen: dict[str, str]) -> str:
     named = [{quantity for quantity, columns in _find_candidates(row, chosen).items() if columns} for row in cells]
     best = max(range(len(named)), key=lambda row: len(named[row]))
     if named[best] and (merged := grid.merged_columns(best)):
-        return _describe_merged(grid, best, min(merged))
+        return describe_merged(grid, best, min(merged))
     shown = f"{grid.place(best)}: {', '.join(grid.rows[best])[:100]!r}"
     missing = [quantity for quantity in WORDS if quantity not in named[best]]
     if not missing:
@@ -368,7 +333,8 @@ def _missing_header(grid: Grid, chosen: dict[str, str]) -> str:
     return f"{shown} names no {repr(chosen[quantity]) if quantity in chosen else quantity}; {remedy}"
 
 
-def _describe_merged(grid: Grid, row: int, column: int) -> str:
+def describe_merged(grid: Grid, row: int, column: int) -> str:
+    """Describe the fault of a title that is merged with its right neighbour."""
     fault = "merged with the cell to its right; unmerge them and name each column"
     return f"{grid.place(row, column)}: {grid.rows[row][column]}: {fault}"
 

@@ -1,0 +1,49 @@
+"""Titles of columns, with their units."""
+
+from __future__ import annotations
+
+import re
+
+# Standard gravity [m/s2], which is also the number of newtons per kilogram-force.
+GRAVITY = 9.80665
+
+# Factors from units to SI units, the usual unit first.
+UNITS = {
+    "time": {"s": 1.0, "ms": 1e-3, "min": 60.0},
+    "depth": {"mm": 1e-3, "m": 1.0, "cm": 1e-2, "um": 1e-6},
+    "force": {"N": 1.0, "mN": 1e-3, "kN": 1e3, "gf": 1e-3 * GRAVITY, "kgf": GRAVITY},
+}
+# Aliases of units, such as sec and g of texture analysers.
+UNIT_ALIASES = {"sec": "s", "g": "gf", "kg": "kgf", "µm": "um", "\N{GREEK SMALL LETTER MU}m": "um"}
+
+# Reversed title with a unit: Time, s; Fz [gf]; Force (mN); Weg / mm; Force_N; Kraft in N.
+REVERSED_UNIT = re.compile(r"[\])]?([^\s,/_\[\]()]+)(?:\s+ni(?=[\s,/_\[(]))?[\s,/_\[(]+(.*)")
+
+
+def fold(text: str) -> str:
+    """Normalise case and spaces."""
+    return " ".join(text.split()).casefold()
+
+
+def unit_factor(quantity: str, unit: str) -> float | None:
+    """Return the factor from a unit to SI; None if it is not a unit of the quantity."""
+    unit, known = unit.strip("[]() "), UNITS[quantity]
+    # In lower case, meganewtons (MN) would be millinewtons.
+    if unit in known or unit == "MN":
+        return known.get(unit)
+    lower = {name.casefold(): scale for name, scale in known.items()}
+    return lower.get(UNIT_ALIASES.get(unit.casefold(), unit.casefold()))
+
+
+def split_title(title: str, quantity: str) -> tuple[str, float | None]:
+    """Split a title into its name and the factor of its unit; None without a unit of the quantity."""
+    match_ = REVERSED_UNIT.fullmatch(title[::-1])
+    scale = unit_factor(quantity, match_[1][::-1]) if match_ else None
+    return (match_[2][::-1], scale) if match_ and scale is not None else (title, None)
+
+
+def split_choice(title: str, quantity: str) -> tuple[str, float | None]:
+    """Split a selected title, as `split_title` does, but only at its last comma."""
+    name, _, unit = (part.strip() for part in title.rpartition(","))
+    scale = unit_factor(quantity, unit)
+    return (name, scale) if name and scale is not None else (title, None)
