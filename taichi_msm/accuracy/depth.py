@@ -8,7 +8,7 @@ import numpy as np
 
 from taichi_msm.model.geometry import CurvedRest
 from taichi_msm.scene.surface import RestSurface
-from taichi_msm.surfaces.depth_map import DepthMap
+from taichi_msm.surfaces.depths import Depths
 
 # Numbers are in steps with at most this many values, and with this share of equal neighbours in rows or columns.
 MAX_VALUES, EQUAL_NEIGHBOURS = 4096, (0.05, 0.95)
@@ -30,7 +30,7 @@ def depth_steps(surface: RestSurface, rest: CurvedRest) -> DepthSteps | None:
         return None
     x, y, width, height = surface.frame.region
     numbers = surface.depth.numbers.values[y : y + height, x : x + width]
-    is_known = DepthMap.of(numbers, 1.0).is_known
+    is_known = Depths.of(numbers, 1.0).is_known
     values = np.unique(numbers[is_known]).astype(float)
     if not 1 < len(values) <= MAX_VALUES or not _has_plateaus(np.where(is_known, numbers, np.nan)):
         return None

@@ -16,7 +16,7 @@ from taichi_msm.model.mask import Mask, sample_nearest
 from taichi_msm.model.pictured import Picture
 from taichi_msm.scene.sheet import SheetMask
 from taichi_msm.scene.surface import DepthMap, Frame
-from taichi_msm.surfaces import depth_map
+from taichi_msm.surfaces.depths import Depths
 from taichi_msm.surfaces.smoothing import smooth_inverse_depth
 from taichi_msm.surfaces.surface import Surface, depth_surface, given_grid, positions
 from taichi_msm.system.array_cache import cached_arrays
@@ -63,7 +63,7 @@ def read_relief(section: DepthMap, frame: Frame, picture: Picture, mask: SheetMa
     if min(width, height) < 2:
         raise PictureError(f"{path} has {width} x {height} pixels in the region", "take at least 2 x 2")
     require_memory(path, DEPTH_PIXEL_BYTES * width * height, "cut the region, or scale the picture down")
-    known = depth_map.DepthMap.of(numbers[y : y + height, x : x + width], section.metres)
+    known = Depths.of(numbers[y : y + height, x : x + width], section.metres)
     centres = np.stack(np.meshgrid(np.arange(width) + 0.5, np.arange(height) + 0.5), axis=-1)
     corner = np.array([x, y], float)
     pixels = picture.view.undistort(centres + corner)
@@ -103,7 +103,7 @@ def read_relief(section: DepthMap, frame: Frame, picture: Picture, mask: SheetMa
         row, column = np.unravel_index(int(is_endless.argmax()), inverse.shape)
         remedy = "cut the region, or leave the place out by sheet.mask"
         fault = f"its smoothed depth jumps to infinity at {_pixel(column, row, frame)}"
-        raise PictureError(f"{path}: {fault}, beside much smaller ones", remedy)
+        raise PictureError(f"{path}: {fault}, next to much smaller ones", remedy)
     return Relief(_in_world(inverse, picture), filled, float(deviation), key)
 
 

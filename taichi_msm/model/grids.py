@@ -75,7 +75,7 @@ def _read_or_compute(surface: Surface, points: tuple[int, int], digest: str) -> 
             path.touch()
             return grid
     try:
-        grid = even_grid(surface, points, _progress.get()).fractions
+        grid = even_grid(surface, points, _progress.get())
     except FoldedGridError as error:
         across, down = error.place
         place = f"{across:.3g} across and {down:.3g} down"

@@ -182,7 +182,7 @@ def largest_mean(factors: Array) -> float:
     return float((sum_around_points(factors) / sum_around_points(np.ones_like(factors))).max())
 
 
-def area_shares(sheet: Sheet) -> Array:
+def rectangle_shares(sheet: Sheet) -> Array:
     """Return the share of a cell's area at each point of a whole rectangle: 1, at edges 1/2, at corners 1/4."""
     rows, cols = np.ones(sheet.points[0]), np.ones(sheet.points[1])
     rows[[0, -1]], cols[[0, -1]] = 0.5, 0.5
@@ -191,7 +191,7 @@ def area_shares(sheet: Sheet) -> Array:
 
 def point_areas(material: Material, sheet: Sheet) -> Array:
     """Return the area of each mass point as a share of a cell's, shape (rows, cols)."""
-    return area_shares(sheet) if material.shares is None else material.shares
+    return rectangle_shares(sheet) if material.shares is None else material.shares
 
 
 def cell_aspect_ratio(sheet: Sheet) -> float:

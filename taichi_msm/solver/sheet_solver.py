@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from taichi_msm.errors import ArgumentError, DeviceError, MsmError, Pause
 from taichi_msm.model.loads import Schedule
 from taichi_msm.model.plan import Plan
-from taichi_msm.model.sheet import area_shares, axes, spacing
+from taichi_msm.model.sheet import axes, rectangle_shares, spacing
 from taichi_msm.model.time_grid import DTYPES
 from taichi_msm.solver.arrays import InitialData, SheetKernel, SheetLayout
 from taichi_msm.solver.state import Reading, State
@@ -201,7 +201,7 @@ class SheetSolver(ABC, Generic[Kernel]):
 
 def _initial_data(plan: Plan, layout: SheetLayout, state: State | None) -> InitialData:
     sheet, config = plan.scene.sheet, layout.config
-    column, areas, mobility = np.arange(layout.cols), area_shares(sheet), plan.mobility
+    column, areas, mobility = np.arange(layout.cols), rectangle_shares(sheet), plan.mobility
     by_column, places = np.empty((base.BY_COLUMN.count, layout.cols)), base.BY_COLUMN
     # One row of each kind: first, middle, last.
     by_column[places.mobility] = mobility[[0, layout.rows // 2, -1]]

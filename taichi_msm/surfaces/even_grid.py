@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import NamedTuple
 
 import numpy as np
 
@@ -32,15 +31,8 @@ class FoldedGridError(Exception):
         self.place = place
 
 
-class EvenGrid(NamedTuple):
-    """Grid that is even on a surface."""
-
-    fractions: Array  # p, across and down, shape (rows, cols, 2)
-    aspect: float  # r, of the sides of cells across and down
-
-
-def even_grid(surface: Surface, points: tuple[int, int], progress: ProgressCallback | None = None) -> EvenGrid:
-    """Return the even grid of (rows, cols) mass points; a FoldedGridError where it cannot begin.
+def even_grid(surface: Surface, points: tuple[int, int], progress: ProgressCallback | None = None) -> Array:
+    """Return p, across and down, shape (rows, cols, 2), of an even grid; a FoldedGridError where it cannot begin.
 
     Points on a side of the picture stay on it. `progress` has the completed and the largest number of iterations; its
     last call is complete.
@@ -54,7 +46,7 @@ def even_grid(surface: Surface, points: tuple[int, int], progress: ProgressCallb
     coarse = _minimise(surface, given_grid(START_POINTS), report)
     even = _minimise(surface, _spread(coarse, points), lambda done: report(MAX_ITERATIONS + done))
     report(total)
-    return EvenGrid(even, GridObjective(surface, points).at(positions(surface, even)).aspect)
+    return even
 
 
 def _spread(grid: Array, points: tuple[int, int]) -> Array:

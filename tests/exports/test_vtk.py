@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from taichi_msm.exports.export import export
 from taichi_msm.exports.vtk import speed
-from taichi_msm.model.sheet import area_shares, rest_positions
+from taichi_msm.model.sheet import rectangle_shares, rest_positions
 from taichi_msm.runs.finished import read_run
 from tests import reference
 
@@ -50,7 +50,7 @@ def test_point_data_of_every_frame(ran: Path, out: Path) -> None:
         np.testing.assert_array_equal(arrays["displacement"], displacement.reshape(-1, 3))
         np.testing.assert_array_equal(arrays["speed"], speed(run.positions(), run.time, frame).ravel())
         # The energy of all springs, by the reference implementation.
-        area = area_shares(run.scene.sheet).ravel() * (0.3 / 8) * (0.4 / 10)
+        area = rectangle_shares(run.scene.sheet).ravel() * (0.3 / 8) * (0.4 / 10)
         total = reference.energy(run.scene, displacement)
         assert (arrays["energy_density"] * area).sum() == pytest.approx(total, rel=1e-12)
         assert grid.GetNumberOfCells() == 2 * 8 * 10

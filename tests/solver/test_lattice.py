@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from taichi_msm.model.loads import evaluate_loads
 from taichi_msm.model.plan import Plan
-from taichi_msm.model.sheet import Springs, area_shares, rest_positions
+from taichi_msm.model.sheet import Springs, rectangle_shares, rest_positions
 from taichi_msm.scene.scene import Scene
 from taichi_msm.solver.dynamics import Dynamics
 from taichi_msm.solver.planning import make_plan, stable_step
@@ -88,7 +88,7 @@ def random_springs(plan: Plan, *, tense: bool = False, curved: bool = False) -> 
 
 def points() -> dict[str, Any]:
     """An inner point that is fixed, one with half a mass and area, and one with twice as much."""
-    fixed, shares = np.zeros((ROWS, COLS), dtype=bool), area_shares(plan_with().scene.sheet)
+    fixed, shares = np.zeros((ROWS, COLS), dtype=bool), rectangle_shares(plan_with().scene.sheet)
     fixed[:, 0] = fixed[4, 5] = True
     shares[6, 3], shares[2, 8] = 0.5, 2.0
     return {"fixed": fixed, "shares": shares}

@@ -87,17 +87,17 @@ def test_gradient(name: str) -> None:
 def test_cells_on_walls_are_isotropic(name: str) -> None:
     surface = depth_surface(WALLS[name], sight)
     grid = even_grid(surface, POINTS)
-    x, given = positions(surface, grid.fractions), positions(surface, given_grid(POINTS))
+    x, given = positions(surface, grid), positions(surface, given_grid(POINTS))
     assert mean_isotropy_error(given) > 0.1
     assert mean_isotropy_error(x) < 0.007  # as on planes at 40 degrees
     area = Cells.of(x).area
     sides = [np.linalg.norm(np.diff(x, axis=axis), axis=-1).min() for axis in (0, 1)]
     assert min(sides) > 0.15 * np.sqrt(area.mean())
-    assert is_unfolded(grid.fractions)
+    assert is_unfolded(grid)
 
 
 def test_points_on_sides_stay_there() -> None:
-    p = even_grid(depth_surface(WALLS["tube"], sight), POINTS).fractions
+    p = even_grid(depth_surface(WALLS["tube"], sight), POINTS)
     given = given_grid(POINTS)
     assert (p[:, [0, -1], 0] == given[:, [0, -1], 0]).all()
     assert (p[[0, -1], :, 1] == given[[0, -1], :, 1]).all()
@@ -106,17 +106,20 @@ def test_points_on_sides_stay_there() -> None:
 
 def test_aspect_is_that_of_square_cells() -> None:
     """On a plane across the view the grid stays, and r is that of the picture's cells."""
-    grid = even_grid(depth_surface(plane(0), sight), (17, 33))
+    surface = depth_surface(plane(0), sight)
+    grid = even_grid(surface, (17, 33))
     # Where r is best, the first term is 1 for rectangles, and the second smallest for equal areas.
-    assert grid.fractions == pytest.approx(given_grid((17, 33)), abs=1e-6)
-    assert grid.aspect == pytest.approx((160 / 32) / (128 / 16))
+    assert grid == pytest.approx(given_grid((17, 33)), abs=1e-6)
+    assert GridObjective(surface, (17, 33)).at(positions(surface, grid)).aspect == pytest.approx(
+        (160 / 32) / (128 / 16)
+    )
 
 
 def test_result_is_a_minimum() -> None:
     """Another minimiser, from another start, finds the same grid."""
     surface, points = depth_surface(WALLS["folds"], sight), (11, 13)
     objective = GridObjective(surface, points)
-    grid = even_grid(surface, points).fractions
+    grid = even_grid(surface, points)
 
     def flat(p: Array) -> tuple[float, Array]:
         value, gradient = objective(p.reshape(grid.shape))
@@ -133,14 +136,14 @@ def test_points_of_a_grid() -> None:
     """Points of a plane, bunched together: the even grid spreads them."""
     u, v = np.moveaxis(given_grid((9, 11)), -1, 0)
     surface = point_surface(np.stack([u + u * u, v + u * v, 0 * u], axis=-1))
-    x = positions(surface, even_grid(surface, (21, 26)).fractions)
+    x = positions(surface, even_grid(surface, (21, 26)))
     assert mean_isotropy_error(x) < 0.01 < 0.1 < mean_isotropy_error(positions(surface, given_grid((21, 26))))
 
 
 @pytest.mark.parametrize("points", [(2, 2), (2, 9), (9, 2)])
 def test_points_on_sides_alone(points: tuple[int, int]) -> None:
     """Those of a plane across the view stay, also across the sides that have no others."""
-    assert even_grid(depth_surface(plane(0), sight), points).fractions == pytest.approx(given_grid(points), abs=1e-5)
+    assert even_grid(depth_surface(plane(0), sight), points) == pytest.approx(given_grid(points), abs=1e-5)
 
 
 def test_turned_corners_are_refused() -> None:
