@@ -15,15 +15,18 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 from scipy.cluster.vq import kmeans2
+from scipy.spatial import cKDTree
 from scipy.spatial.distance import cdist
 
 from benchmarks.marked import replace_marked, table
 from taichi_msm.arithmetic import Array
 from taichi_msm.palpation.fit import fit_presses
 from taichi_msm.palpation.palpate import palpate
+from taichi_msm.palpation.plane import find_plane
 from taichi_msm.palpation.presses import Presses
 from taichi_msm.palpation.process import fit_process
 from taichi_msm.palpation.result import Palpation
+from taichi_msm.palpation.scene import MARGIN_RADII
 
 DOCS = Path(__file__).parent
 PAGE, IMAGES = DOCS / "palpation.md", DOCS / "images"
@@ -89,6 +92,13 @@ def repeatability(first: Palpation, second: Palpation, reach: float = 2e-3) -> t
     return float(np.corrcoef(one, other)[0, 1]), int(near.sum())
 
 
+def flatness(result: Palpation) -> tuple[float, float]:
+    """Return the share of the sheet farther than a length from the presses, and the deviation of heights [m]."""
+    plane = find_plane(result.presses.position, result.normal, MARGIN_RADII * result.map.fit.law.radius)
+    distance = cKDTree(result.presses.position).query(plane.pixels(100, 100).reshape(-1, 3))[0]
+    return float(np.mean(distance > result.map.process.length)), float(plane.places[:, 2].std())
+
+
 def interval(values: list[float]) -> str:
     """Format the range of some values."""
     low, high = (f"{value:.2f}" for value in (min(values), max(values)))
@@ -144,6 +154,9 @@ def main() -> None:
     PAGE.write_text(page, encoding="utf-8")
     correlation, count = repeatability(results["silicone_T1"], results["silicone_T2"])
     print(f"the maps of two runs correlate by {correlation:.2f} at {count} places")
+    for name, result in results.items():
+        share, height = flatness(result)
+        print(f"{name}: {100 * share:.1f} % of the sheet is grey; heights above the plane: {1000 * height:.2f} mm")
 
 
 if __name__ == "__main__":

@@ -15,6 +15,9 @@ from taichi_msm.palpation.result import Palpation
 from taichi_msm.palpation.scores import score
 from taichi_msm.palpation.table import read_table
 
+# Depth in radii of the ball, above which its unit is questioned.
+MAX_RADII = 5.0
+
 
 def palpate(
     table: str,
@@ -40,6 +43,9 @@ def palpate(
         built = build_map(presses, fit)
         scores = score(presses, fit, lambda done, total: progress("scores", done, total))
         predicted, notes = None, [*read.notes]
+        if (deepest := float(presses.greatest_depth.max())) > MAX_RADII * radius:
+            fault = f"depths up to {1000 * deepest:.3g} mm, more than {MAX_RADII:g} radii of the ball"
+            notes.append(f"{read.name}: {fault}; check the units of depth and --radius")
         if to_predict is not None:
             others = presses_to_predict(to_predict)
             predicted = others, built.predict(others)

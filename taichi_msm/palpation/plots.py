@@ -30,6 +30,9 @@ UNKNOWN = "#D0D0D0"
 # Least ratio of the ends of the colours.
 MIN_RATIO = 1.1
 
+# Largest number of letters of a label of a press.
+MAX_LABEL_LENGTH = 20
+
 MM, N_PER_CM3 = 1e3, 1e-6
 
 
@@ -74,7 +77,7 @@ def _draw_map(figure: Figure, result: Palpation, plane: Plane) -> None:
     left, right = figure.subplots(1, 2, sharey=True)
     grey = f"; grey: over {MM * length:.2g} mm from every press" if is_unknown.any() else ""
     _draw_panel(left, plane, stiffness, norm, "viridis", "stiffness [N/cm³]: dark soft, bright stiff")
-    left.set_title("Stiffness; dots: presses, with their own")
+    left.set_title("Stiffness of the map; dots: of each press")
     left.scatter(
         *MM * plane.places[:, :2].T, c=measured, cmap="viridis", norm=norm, s=16, edgecolors="white", linewidths=0.7
     )
@@ -82,14 +85,12 @@ def _draw_map(figure: Figure, result: Palpation, plane: Plane) -> None:
     right.set_title(f"Uncertainty{grey}")
     right.plot(*MM * plane.places[:, :2].T, ".", color="white", markersize=2)
     left.set_ylabel("across [mm]")
-    for n, name in ((measured.argmax(), "stiffest"), (measured.argmin(), "softest")):
-        label = f"{name}: place {printable(result.presses.places[n])}"
-        x, y, _ = MM * plane.places[n]
-        side = (plane.places[n, 0] - plane.low[0]) / plane.size[0]
-        alignment = "left" if side < 1 / 4 else "right" if side > 3 / 4 else "center"
-        box = {"boxstyle": "round,pad=0.2", "facecolor": "white", "edgecolor": "none", "alpha": 0.8}
-        shown = {"ha": alignment, "va": "bottom", "fontsize": 7, "parse_math": False, "bbox": box}
-        left.annotate(label, (x, y), (0, 6), textcoords="offset points", **shown)
+    for n, name, marker in ((measured.argmax(), "stiffest", "^"), (measured.argmin(), "softest", "v")):
+        label = f"{name}: place {printable(result.presses.places[n])[:MAX_LABEL_LENGTH]}"
+        style_of_extreme = {"markersize": 12, "color": "none", "markeredgecolor": VERMILION, "markeredgewidth": 1.5}
+        left.plot(*MM * plane.places[n, :2], marker, label=label, **style_of_extreme)
+    for text in figure.legend(loc="upper right", ncols=2, frameon=False).get_texts():
+        text.set_parse_math(False)
 
 
 def _draw_panel(axes: Axes, plane: Plane, values: Array, norm: Normalize, colours: str, label: str) -> None:
@@ -133,7 +134,8 @@ def _draw_curves(figure: Figure, result: Palpation) -> None:
         axes.plot(MM * fine, fit.stiffness[n] * fit.law.force(fine + fit.offset[n]), color=INK, label="fitted")
         axes.plot(depth, presses.force[rows], "o", color=VERMILION, label="measured")
         error = f"{100 * scores.map[n]:.2g} % off"
-        axes.set_title(f"{title}: place {printable(presses.places[n])}, {error}", parse_math=False)
+        label = printable(presses.places[n])[:MAX_LABEL_LENGTH]
+        axes.set_title(f"{title}: place {label}, {error}", parse_math=False)
         axes.set(xlabel="depth of the table [mm]")
     figure.axes[0].set_ylabel("force [N]")
     figure.axes[0].legend(loc="upper left")

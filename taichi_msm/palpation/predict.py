@@ -1,12 +1,14 @@
 """Map of the stiffness, and forces of presses at other places.
 
 K at the mean offset c contains the effect of the offset o of its press, to first order exp(h (o - c)), with h the mean
-d log g / do of the presses; the noise of the process contains it too. So the offset of a new press changes the
-logarithm of its force by (d log g / do - h) (o - c) in addition to that noise.
+d log g / do of the presses. As stiffness and offset may be correlated, log K at the mean offset depends on the offset
+by b (o - c), with b from the presses by generalised least squares: b is h where the two are independent. A new press
+has the stiffness exp(map + (b - h) (o - c) + e), with e the part of the noise of the process that b (o - c) leaves.
 """
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -35,7 +37,8 @@ class StiffnessMap:
 
     fit: PressFit
     process: Process
-    slope: float  # h, the mean effect of an offset on log K at the mean offset [1/m]
+    slope: float  # b - h, the change of log K with the offset [1/m]
+    scatter: float  # standard deviation of e
 
     def stiffness(self, places: Array) -> tuple[Array, Array, Array]:
         """Return K and the ends of its 95 % interval, without noise [N/m3], at places [m], shape (k, 3)."""
@@ -49,14 +52,18 @@ class StiffnessMap:
         law, prior, index = self.fit.law, self.fit.prior, presses.index
         stiffness, depth = np.exp(mean)[index], presses.depth + prior.mean
         force = stiffness * law.force(depth)
-        of_offset = prior.width * (stiffness * law.slope(depth) - self.slope * force)
+        # The force is not linear in the offset: near the contact, it is 0 on one side.
+        shifted = [
+            stiffness * math.exp(self.slope * shift) * law.force(depth + shift)
+            for shift in (-NORMAL_90 * prior.width, 0.0, NORMAL_90 * prior.width)
+        ]
         peak = np.zeros(presses.count)
         np.maximum.at(peak, index, force)
-        others = of_offset**2 + (prior.noise * peak[index]) ** 2
-        spread = np.sqrt(deviation**2 + self.process.noise**2)[index]
+        of_noise = NORMAL_90 * prior.noise * peak[index]
+        spread = NORMAL_90 * np.hypot(deviation, self.scatter)[index]
         low, high = (
-            force + sign * np.sqrt((force * np.expm1(sign * NORMAL_90 * spread)) ** 2 + NORMAL_90**2 * others)
-            for sign in (-1, 1)
+            force + sign * np.sqrt((force * np.expm1(sign * spread)) ** 2 + (end - force) ** 2 + of_noise**2)
+            for sign, end in ((-1, np.min(shifted, axis=0)), (1, np.max(shifted, axis=0)))
         )
         return Forces(force, low, high)
 
@@ -68,7 +75,10 @@ def build_map(presses: Presses, fit: PressFit) -> StiffnessMap:
     squares = presses.sum(force**2)
     touches = squares > 0
     effect = float(np.mean(presses.sum(force * slope)[touches] / squares[touches]))
-    return StiffnessMap(fit, fit_process(presses.position, np.log(fit.mean_stiffness)), effect)
+    process = fit_process(presses.position, np.log(fit.mean_stiffness))
+    of_process = process.regress(fit.offset - fit.prior.mean)
+    scatter = math.sqrt(max(process.noise**2 - (of_process * fit.prior.width) ** 2, 0.0))
+    return StiffnessMap(fit, process, of_process - effect, scatter)
 
 
 def relative_residual(presses: Presses, force: Array) -> Array:

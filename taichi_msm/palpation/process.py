@@ -54,6 +54,10 @@ class Process:
         mean, deviation = (np.concatenate(part) for part in zip(*parts, strict=True))
         return mean, deviation
 
+    def regress(self, variable: Array) -> float:
+        """Return the slope of the values with another variable, shape (n,), by generalised least squares."""
+        return float(variable @ self.weights / (variable @ cho_solve((self.factor, True), variable)))
+
     def _predict(self, places: Array) -> tuple[Array, Array]:
         covariance = (1 - self.share) * correlation(places, self.places, self.length)
         known = (solve_triangular(self.factor, covariance.T, lower=True, check_finite=False) ** 2).sum(axis=0)

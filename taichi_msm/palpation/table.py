@@ -6,6 +6,7 @@ which points out of the tissue and is z by default. Without labels of places, a 
 
 from __future__ import annotations
 
+import math
 import re
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -229,12 +230,13 @@ def _read_numbers(
     """Return the numbers of each column in SI units, and the last digit of the forces [N]."""
     cells = [(n, column.index) for n in rows for column in columns.values()]
     parsed = grid.numbers(header, cells, "take a number, or delete the row")
-    numbers, digit = {}, 0.0
+    numbers, digit = {}, math.inf
     for k, (name, column) in enumerate(columns.items()):
         of_column = parsed[k :: len(columns)]
         numbers[name] = np.array([value for value, _ in of_column]) * column.scale
         if KINDS[name] == "force":
-            digit = max(digit, 10.0 ** min(power for _, power in of_column) * column.scale)
+            # Components that are 0 are written without digits.
+            digit = min(digit, 10.0 ** min(power for _, power in of_column) * column.scale)
     return numbers, digit
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -140,6 +141,32 @@ def test_coverage_of_new_presses_with_other_offsets() -> None:
     # 90 % within three standard deviations of 360 independent presses. If offsets counted both in the noise of the map
     # and by themselves, it would be 95 %.
     assert 0.85 < np.mean(shares) < 0.93
+
+
+def test_width_of_the_offsets_in_small_tables() -> None:
+    # Offsets are known to about their width, so without a prior a width of 0 is likeliest in some of these tables.
+    widths = [fit_presses(make_presses(20, seed=seed).presses, RADIUS).prior.width for seed in range(500, 512)]
+    assert min(widths) > OFFSET_WIDTH / 3
+    assert np.median(widths) == pytest.approx(OFFSET_WIDTH, rel=0.5)
+
+
+@pytest.mark.parametrize("coupling", [0.0, -900.0])
+def test_predicted_intervals_at_every_depth(coupling: float) -> None:
+    """Presses whose log K depends on their offset by `coupling` [1/m]: -900 balances its effect on the force."""
+    known, new = (make_presses(count, width=4e-4, seed=seed) for count, seed in ((200, 1), (1000, 2)))
+    presses, others = (
+        replace(each.presses, force=each.presses.force * factor[each.presses.index])
+        for each in (known, new)
+        for factor in [np.exp(coupling * (each.offset - MEAN_OFFSET))]
+    )
+    forces = build_map(presses, fit_presses(presses, RADIUS)).predict(others)
+    below, above = (
+        outside.reshape(1000, 10).mean(axis=0) for outside in (others.force < forces.low, others.force > forces.high)
+    )
+    # 5 % by each end; of 1000 presses 0.7 % is a standard deviation, and the 200 that are known give as much again.
+    # The effect of an offset of half the depth is no longer linear in log K, so fewer are below and more above.
+    assert max(below.max(), above.max()) < 0.09, (below, above)
+    assert 0.06 < (below + above).min() <= (below + above).max() < 0.13, (below, above)
 
 
 def test_scores_use_the_other_presses_alone(truth: Truth, fitted: PressFit) -> None:

@@ -204,6 +204,12 @@ def test_without_matplotlib(
     assert not (tmp_path / "map" / "map.png").exists()
 
 
+def test_unlikely_depths(truth: Truth, tmp_path: Path, program: Program, message: Messages) -> None:
+    table = write_table(tmp_path / "liver.csv", truth.presses.subset(np.arange(12)))
+    done = program("palpation", str(table), "--radius", "0.4mm", "--out", str(tmp_path / "map"), "--json")
+    message(json.loads(done.stdout)["notes"], "--radius")
+
+
 def test_places_too_far_apart_for_a_scene(truth: Truth, tmp_path: Path, program: Program, message: Messages) -> None:
     far = replace(truth.presses.subset(np.arange(12)), position=1000 * truth.presses.position[:12])
     table = write_table(tmp_path / "liver.csv", far)

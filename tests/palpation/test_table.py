@@ -94,6 +94,12 @@ def test_chosen_columns(read: Read) -> None:
     assert table.force.max() == pytest.approx(2.1 * 0.9)
 
 
+def test_components_of_0_without_digits(read: Read) -> None:
+    table = read(f"{VECTORS}\n{UNITS}\n{rows(line='p{n},{x},{y},5.0,0,0,1,{d},0,0,{f}')}")
+    assert table.digit == pytest.approx(1e-3)
+    assert not choose_presses(table)[1]
+
+
 def test_chosen_force_instead_of_a_vector(read: Read) -> None:
     assert_is_table(read(f"{HEADER},fx_N,fy_N,fz_N\n{rows(line='p{n},{x},{y},5.0,{d},{f},1,2,3')}", "force=force, N"))
 
