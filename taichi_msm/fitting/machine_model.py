@@ -25,12 +25,10 @@ from taichi_msm.machines.loading import (
     late_contact_note,
     require_plausible_travel,
 )
-from taichi_msm.machines.reader import cut_window, read_machine_test
+from taichi_msm.machines.reader import TABLE_SUFFIXES, cut_window, read_machine_test
 from taichi_msm.model.plan import Plan
 from taichi_msm.runs.simulation import Simulation
 from taichi_msm.scene.scene import Scene
-
-TABLE_SUFFIXES = (".csv", ".tsv", ".txt", ".xlsx")
 
 # Options of `fit` for tables only, and for observed points only.
 TABLE_OPTIONS = ("columns", "sheet", "block", "window", "rate", "contact")
