@@ -39,6 +39,9 @@ MIN_RANGES = {"time": (1e-9, "s"), "depth": (1e-12, "m"), "force": (1e-15, "N")}
 # Content of a table, for messages.
 CONTENT = "time, depth and force"
 
+# Number of rows that are searched for the titles of a faulty table.
+MAX_SHOWN_ROWS = 10_000
+
 # Titles that shells leave unchanged within double quotes.
 SAFE = re.compile(r"[\w .,:;/()\[\]°%#+-]+")
 
@@ -286,7 +289,8 @@ def _missing_columns(grid: Grid, block: Block | None, chosen: dict[str, str]) ->
     if not any(grid.rows):
         return f"{grid.title}: is empty; a table has columns of time, depth and force"
     # Find the row with most quantities; a text without a header or numbers is not split.
-    cells = [row if grid.sheet else re.split(r"[\t;,|]", ";".join(row)) for row in grid.rows]
+    rows = grid.rows[: MAX_SHOWN_ROWS if block is None else block.rows[0]]
+    cells = [row if grid.sheet else re.split(r"[\t;,|]", ";".join(row)) for row in rows]
     named = [{quantity for quantity, columns in find_candidates(row, chosen).items() if columns} for row in cells]
     best = max(range(len(named)), key=lambda row: len(named[row]))
     if named[best] and (merged := grid.merged_columns(best)):

@@ -19,6 +19,13 @@ UNITS = {
         **{"lbf": POUND * GRAVITY, "ozf": POUND * GRAVITY / 16},
     },
 }
+LOWER_UNITS = {
+    quantity: {unit.casefold(): factor for unit, factor in units.items()} for quantity, units in UNITS.items()
+}
+
+# Longest cell that may be a unit [characters].
+MAX_UNIT_LENGTH = 20
+
 # Aliases of units, such as sec and g of texture analysers.
 UNIT_ALIASES = {"sec": "s", "inch": "in", "g": "gf", "kg": "kgf", "lb": "lbf", "lbs": "lbf", "oz": "ozf"}
 
@@ -39,12 +46,11 @@ def fold(text: str) -> str:
 
 def unit_factor(quantity: str, unit: str) -> float | None:
     """Return the factor from a unit to SI; None if it is not a unit of the quantity."""
-    unit, known = unit.strip("[](). ").translate(MICRO), UNITS[quantity]
+    unit = unit[:MAX_UNIT_LENGTH].strip("[](). ").translate(MICRO)
     # In lower case, meganewtons (MN) would be millinewtons.
-    if unit in known or unit == "MN":
-        return known.get(unit)
-    lower = {name.casefold(): scale for name, scale in known.items()}
-    return lower.get(UNIT_ALIASES.get(unit.casefold(), unit.casefold()))
+    if unit in UNITS[quantity] or unit == "MN":
+        return UNITS[quantity].get(unit)
+    return LOWER_UNITS[quantity].get(UNIT_ALIASES.get(unit.casefold(), unit.casefold()))
 
 
 def has_unit(cell: str) -> bool:
