@@ -289,7 +289,7 @@ def _missing_columns(grid: Grid, block: Block | None, chosen: dict[str, str]) ->
     if not any(grid.rows):
         return f"{grid.title}: is empty; a table has columns of time, depth and force"
     # Find the row with most quantities; a text without a header or numbers is not split.
-    rows = grid.rows[: MAX_SHOWN_ROWS if block is None else block.rows[0]]
+    rows = grid.rows[: MAX_SHOWN_ROWS if block is None else block.rows[0] + 1]
     cells = [row if grid.sheet else re.split(r"[\t;,|]", ";".join(row)) for row in rows]
     named = [{quantity for quantity, columns in find_candidates(row, chosen).items() if columns} for row in cells]
     best = max(range(len(named)), key=lambda row: len(named[row]))
