@@ -73,8 +73,8 @@ def fit(
         observed: an .npz file, or a mapping of arrays: `time` [s], shape (T,); `coordinates` of points, across and
             down, shape (N, 2); `position` [m], shape (N, T, 3), or `pixel` [px] of the scene's camera, shape (N, T, 2),
             NaN where not observed; optionally `sigma`, the standard deviation of their errors. Or a run's
-            trajectory.npz or tracks.npz. Or one or more tables of a testing machine, .csv, .tsv, .txt or .xlsx, with
-            time, depth and force, which the scene's only position-controlled tool follows.
+            trajectory.npz or tracks.npz. Or one or more tables of a testing machine, .csv, .tsv, .txt, .dat, .lvm or
+            .xlsx, with time, depth and force, which the scene's only position-controlled tool follows.
         free: keys of the parameters, dotted paths such as tissue.young or probes.0.total.2. tissue.map is a map of
             R x R cells; with it one component of a force may be free, and its factor then scales all forces. contact,
             or contact.0, ... of several tables, is the depth of contact [m of the table].
@@ -89,7 +89,8 @@ def fit(
             file), `correlation` (correlation length of the errors of tracks [px]), `drift` (correlation time of the
             errors of a track [s]), `resolution` (R of a map). Of tables: `columns` (selected columns, such as
             ["depth=Traverse, mm"]), `sheet` and `block` of a file, `window` (first and last time [s]), `rate` (frames
-            per second), `contact` (depths of contact [m of the table], one for all tables or one each).
+            per second), `contact` (depths of contact [m of the table], one for all tables or one each),
+            `force_offset` (exact forces without contact [N], likewise, positive along the largest force).
 
     Returns:
         The estimates; `identifiable` is False if the data do not determine a parameter.
@@ -148,7 +149,7 @@ def _read_problem(observed: Any, request: Request) -> tuple[FitProblem, MapSetti
     points = points.with_sigma(method.get("sigma"))
     points = points.on_sheet(initial)
     if unused := [name for name in TABLE_OPTIONS if method.get(name)]:
-        raise SceneError([f"--{unused[0]}: only for tables of a testing machine; leave it out"])
+        raise SceneError([f"--{unused[0].replace('_', '-')}: only for tables of a testing machine; leave it out"])
     settings = map_settings(request)
     options = {"forces": forces, **{name: method.get(name) for name in ("robust", "profile", "correlation", "drift")}}
     if settings is not None and (conflicting := [name for name, value in options.items() if value]):

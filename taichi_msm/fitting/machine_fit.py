@@ -73,10 +73,11 @@ def fitted_tests(
         # Residuals r of informative frames lack the offset.
         frame = int(np.argmax(loading.information > 0))
         residual = loading.sigma[frame] * uncertainties.residuals[frames][frame]
-        offset = float(residual - (force - loading.force)[frame])
+        offset = 0.0 if loading.has_exact_offset else float(residual - (force - loading.force)[frame])
         mean_slopes = weights @ slopes[frames] / weights.sum()
         by_parameters = float(np.linalg.norm(mean_slopes @ uncertainties.root))
         error = math.hypot(math.sqrt(uncertainties.factor / weights.sum()), by_parameters)
+        error = 0.0 if loading.has_exact_offset else error
         tests.append(FittedTest(loading.without_offset(offset), values.get(key, loading.contact), force, error))
     return tuple(tests)
 

@@ -198,7 +198,8 @@ class FitResult:
             share = rounded(100 * fitted.residual / peak)
             residual = f"{fitted.residual:.3g} N, {share} % of the peak, at {frames} frames"
             noise = f"noise of the first {fitted.loading.test.noise_rows} rows {fitted.loading.noise:.2g} N"
-            offset = f"offset {fitted.loading.offset:.3g} +- {rounded(fitted.offset_error)} N subtracted"
+            error = "N, as given," if fitted.loading.has_exact_offset else f"+- {rounded(fitted.offset_error)} N"
+            offset = f"offset {fitted.loading.offset:.3g} {error} subtracted"
             details = f"{noise}, {offset}, contact at {1000 * fitted.contact:.4g} mm"
             lines.append(f"{fitted.loading.test.name}: residual {residual}; {details}{chi_text}")
         if not self.tests:

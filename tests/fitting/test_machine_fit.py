@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -243,6 +244,29 @@ def test_uncertainty_of_the_offsets() -> None:
         assert profile.high == pytest.approx(expected[n] + half_width, abs=0.05 * half_width)
 
 
+def test_a_given_offset_is_not_fitted() -> None:
+    """The other test keeps its offset, as in least squares with one more parameter."""
+    misfit, runs = linear_problem()
+    (observed,) = misfit.observations
+    assert isinstance(observed, MachineForces)
+    tests = (replace(observed.tests[0], has_exact_offset=True), observed.tests[1])
+    given = replace(observed, tests=tests)
+    assert given.freedom == observed.freedom + 1
+    rows = np.random.default_rng(5).normal(size=(len(observed.values), 2))
+    count = len(tests[0].force)
+    expected = rows[:count] * (tests[0].information > 0)[:, None]
+    np.testing.assert_array_equal(given.without_offset(rows)[:count], expected)
+    np.testing.assert_array_equal(given.without_offset(rows)[count:], observed.without_offset(rows)[count:])
+    misfit = Misfit([given], [1.0], robust=False)
+    predicted = runs.predict_many([np.array([1.0, 0.0])])[0]
+    solution = Solution(np.array([1.0, 0.0]), predicted, misfit.scales([1.0]), 0.0, converged=True)
+    found = uncertainty(misfit, solution, runs.slopes, ErrorCorrelation(None, None))
+    problem = replace(runs.problem, tests=tests)
+    fitted = fitted_tests(problem, {}, predicted.values[0], runs.slopes, found)
+    assert (fitted[0].loading.offset, fitted[0].offset_error) == (tests[0].offset, 0)
+    assert fitted[1].offset_error > 0
+
+
 def test_offsets_of_a_robust_fit() -> None:
     """Outliers of a tenth of the frames move the offset by less than a standard deviation of a frame."""
     misfit, runs = linear_problem(outliers=24)
@@ -315,6 +339,7 @@ def test_explanations_of_unidentifiable_parameters(message: Messages) -> None:
         ({"drift": 1.0}, "drift"),
         ({"rate": -1.0}, "rate"),
         ({"contact": [1e-3, 1e-3]}, "contact"),
+        ({"force_offset": [0.1, 0.1]}, "force-offset"),
         ({"forces": ("forces.csv", 0.1)}, "forces"),
         ({"free": ["contact.1"]}, "contact.1"),
         ({"free": ["probes.0.path.0.3"]}, "path"),
@@ -332,8 +357,9 @@ def test_options_and_files_of_points_and_tables_exclude_each_other(message: Mess
     with message.raises(SceneError, "tracks.npz"):
         fit(scene(), ["tracks.npz", "press.csv"], ["tissue.young"])
     observed = {"time": [0.0], "coordinates": [[0.5, 0.5]], "position": [[[0.0, 0.0, 0.0]]]}
-    with message.raises(SceneError, "rate"):
-        fit(scene(), observed, ["tissue.young"], rate=5.0)
+    for option, value in {"rate": 5.0, "force_offset": [0.1]}.items():
+        with message.raises(SceneError, option.replace("_", "-")):
+            fit(scene(), observed, ["tissue.young"], **{option: value})  # type: ignore[arg-type]
 
 
 def test_command_with_two_tables(pressed: str, tmp_path: Path, program: Program, message: Messages) -> None:
