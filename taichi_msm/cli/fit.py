@@ -11,6 +11,7 @@ import click
 
 from taichi_msm.cli import common, options
 from taichi_msm.errors import DivergedError
+from taichi_msm.system.process import write_stderr
 
 
 @options.program.command()
@@ -102,6 +103,7 @@ def fit(
                 window=None if window is None else parse_window(window),
                 directory=directory,
                 progress=progress,
+                report=lambda note: None if as_json else write_stderr([note]),
                 **settings,
             )
     except DivergedError as error:

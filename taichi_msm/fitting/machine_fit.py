@@ -14,6 +14,7 @@ from taichi_msm.fitting.machine_model import MachineProblem
 from taichi_msm.fitting.parameters import Parameter, rounded
 from taichi_msm.fitting.uncertainty import Uncertainty
 from taichi_msm.machines.loading import CONTACT_NOISES, Loading
+from taichi_msm.machines.reader import TORE
 
 # Largest change of the depth while the tool is held, as a share of the travel.
 HELD_SHARE = 0.02
@@ -117,7 +118,10 @@ def unknown_notes(tests: Sequence[FittedTest], values: Mapping[str, float]) -> I
             if value > reach:
                 yield f"{key}: {value:.2g} m is beyond the depth reached, {reach:.2g} m; press deeper, or leave it out"
         elif key == "tissue.stiffening.lock":
-            yield f"{key}: the test does not stretch the tissue far enough; pull further, or leave it out"
+            reason = "the test does not stretch the tissue far enough; pull further, or leave it out"
+            if any(TORE in note for fitted in tests for note in fitted.loading.test.notes):
+                reason = f"{TORE}, which the model does not describe; cut the table there by --window"
+            yield f"{key}: {reason}"
 
 
 def explanations(tests: Sequence[FittedTest], *, fits_contact: bool) -> Iterator[str]:

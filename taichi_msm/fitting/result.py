@@ -225,6 +225,7 @@ def _format_estimate(estimate: Estimate) -> str:
         return "?" if number is None else f"{float(f'{number:.{min(max(digits, 2), 9)}g}'):.10g}"
 
     low, high = map(written, estimate.interval)
-    error_text = "?" if error > 1000 * max(abs(estimate.value), abs(estimate.start)) else rounded(error)
+    is_vague = not estimate.identifiable and error > 1000 * max(abs(estimate.value), abs(estimate.start))
+    error_text = "?" if is_vague else rounded(error)
     suffix = "" if estimate.identifiable else ": not identifiable"
     return f"{written(estimate.value)} +- {error_text}, 95 % {low} to {high}, from {estimate.start:.6g}{suffix}"

@@ -19,13 +19,14 @@ from taichi_msm.fitting.least_squares import Misfit, Solution
 from taichi_msm.fitting.machine_curve import CurveRuns, relax
 from taichi_msm.fitting.machine_fit import FittedTest, explanations, fitted_tests, unknown_notes
 from taichi_msm.fitting.machine_model import MachineForces, MachineProblem, read_machine_problem
+from taichi_msm.fitting.machine_units import unit_notes
 from taichi_msm.fitting.observation import ErrorCorrelation
 from taichi_msm.fitting.parameters import Parameter, Request
 from taichi_msm.fitting.predict import Prediction
 from taichi_msm.fitting.profiles import Profiler
 from taichi_msm.fitting.uncertainty import uncertainty
 from taichi_msm.machines.loading import Loading, build_loading, find_approach
-from taichi_msm.machines.reader import MachineTest
+from taichi_msm.machines.reader import TORE, MachineTest
 from taichi_msm.scene.scene import Scene
 from taichi_msm.system.runtime import Device
 from tests.conftest import Program
@@ -330,6 +331,59 @@ def test_explanations_of_unidentifiable_parameters(message: Messages) -> None:
     values = {"tissue.relaxation.0.time": 0.02, "tissue.relaxation.1.time": 90.0, "tissue.relaxation.1.share": 0.1}
     values |= {"tissue.foundation.lock": 0.1, "tissue.stiffening.lock": 4.0}
     message(unknown_notes([fitted], values), "shorter", "longer", "beyond", "stretch")
+
+
+def test_a_tear_is_a_reason_of_an_unknown_lock(message: Messages) -> None:
+    loading = held()
+    test = replace(loading.test, notes=(f"press.csv: {TORE}",))
+    fitted = FittedTest(replace(loading, test=test), loading.contact, loading.force)
+    message(unknown_notes([fitted], {"tissue.stiffening.lock": 4.0}), "tore", "--window")
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "factor", "option"),
+    [
+        ("[N]", "[mN]", 1e3, "force=Force, N"),
+        ("[N]", "[kN]", 1e-5, "force=Force, N"),
+        ("[N]", "[kgf]", 1e-4, "force=Force, gf"),
+        ("[mm]", "[um]", 1e-6, "depth=Depth, mm"),
+        ("[N]", "[N]", 1e-14, "check"),
+        ("[N]", "[N]", 1.0, ""),
+    ],
+)
+def test_units_that_no_tissue_has(
+    old: str, new: str, factor: float, option: str, pressed: str, tmp_path: Path, message: Messages
+) -> None:
+    """Another unit by a factor of 1000 or 9.81 is named where it helps; forces grow with the square of the depth."""
+    text = Path(pressed).read_text().replace(old, new)
+    (tmp_path / "other.csv").write_text(text)
+    request = Request(scene(), [YOUNG], {}, None, {})
+    problem = read_machine_problem([str(tmp_path / "other.csv")], request)
+    (loading,) = problem.tests
+    travel = loading.travel()
+    predicted = factor * loading.peak * (travel / travel.max()) ** 2
+    notes = list(unit_notes(problem, predicted[:, None]))
+    assert len(notes) == bool(option)
+    if notes:
+        message(notes, option, hide=r"\d[\d.e+-]*(?= Pa,)")
+
+
+def test_notes_about_the_table_come_before_the_search(pressed: str, tmp_path: Path) -> None:
+    (tmp_path / "other.csv").write_text(Path(pressed).read_text().replace("[N]", "[mN]"))
+    events: list[str] = []
+    result = fit(
+        scene(),
+        str(tmp_path / "other.csv"),
+        [YOUNG],
+        contact=[CONTACT],
+        workers=1,
+        report=events.append,
+        progress=lambda stage, done, total: events.append(f"{done}"),
+    )
+    (note,) = (event for event in events if not event.isdecimal())
+    assert note in result.notes
+    assert {*events[: events.index(note)]} <= {"0", "1"}
+    assert int(events[-1]) > 3
 
 
 @pytest.mark.parametrize(
