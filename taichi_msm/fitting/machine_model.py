@@ -209,7 +209,7 @@ def read_machine_problem(paths: Sequence[str], request: Request) -> MachineProbl
 
 def _per_table(option: str, noun: str, given: Sequence[float] | None, count: int) -> list[float | None]:
     """Return the number of every table, from one for all, one each, or none."""
-    numbers: list[float | None] = list(given or [None])
+    numbers: list[float | None] = [*given] if given else [None]
     if len(numbers) not in (1, count):
         raise SceneError([f"{option}: {len(numbers)} {noun} for {count} tables; give one, or one per table"])
     return numbers * count if len(numbers) == 1 else numbers

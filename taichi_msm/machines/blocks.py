@@ -65,7 +65,7 @@ class Block:
 
 def find_blocks(grid: Grid, chosen: dict[str, str], min_rows: int = MIN_ROWS) -> list[Block]:
     """Find the blocks with at least `min_rows` rows of numbers; shorter ones are summaries."""
-    headers, blocks, last = [n for n, row in enumerate(grid.rows) if is_header(row, chosen)], [], -1
+    headers, blocks, last = [n for n, row in enumerate(grid.rows) if is_header(row, chosen)], list[Block](), -1
     for header, end in pairwise([*headers, len(grid.rows)]):
         block = _build_block(grid, header, grid.rows[header], end, chosen, last)
         counts = [sum(map(is_value, grid.rows[n])) for n in block.rows]
@@ -85,7 +85,7 @@ def find_blocks_of_numbers(grid: Grid, chosen: dict[str, str]) -> list[Block]:
             is_run = continues
             if is_run:
                 runs[-1].append(n)
-    blocks, last = [], -1
+    blocks, last = list[Block](), -1
     for run in runs:
         if len(run) >= MIN_ROWS:
             header = _titles_above(grid, run[0], last)

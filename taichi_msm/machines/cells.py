@@ -130,7 +130,8 @@ class Grid:
 
 def read_text(name: str, is_header: Callable[[Row], bool], expected: str) -> Grid:
     """Return the cells of a text table; the separator is one that splits a line into a header."""
-    rows, counts, separator, numbers_row, numbers = [], [], "", -1, dict[str, list[bool]]()
+    rows, counts, separator = list[Row](), list[int](), ""
+    numbers_row, numbers = -1, dict[str, list[bool]]()
     data = read_bytes(name, expected)
     if (count := max(data.count(b"\n"), data.count(b"\r"))) > MAX_LINES:
         raise SceneError([f"{name}: {count:,} lines, above {MAX_LINES:,}; delete lines without cells"])

@@ -588,6 +588,7 @@ INVALID_ARGUMENTS: dict[str, dict[str, Any]] = {
     "drift": {"drift": True},
     "resolution": {"resolution": 4.0},
     "columns": {"columns": "depth=Traverse, mm"},
+    "force offset": {"force_offset": 0.1},
     "sheet": {"sheet": 1},
     "block": {"block": "2"},
     "window": {"window": 12.0},

@@ -346,6 +346,7 @@ def test_a_tear_is_a_reason_of_an_unknown_lock(message: Messages) -> None:
         ("[N]", "[mN]", 1e3, "force=Force, N"),
         ("[N]", "[kN]", 1e-5, "force=Force, N"),
         ("[N]", "[kgf]", 1e-4, "force=Force, gf"),
+        ("[N]", "[kN]", 1e-3, "above 1 MPa"),
         ("[mm]", "[um]", 1e-6, "depth=Depth, mm"),
         ("[N]", "[N]", 1e-14, "check"),
         ("[N]", "[N]", 1.0, ""),
