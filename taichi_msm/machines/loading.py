@@ -225,7 +225,8 @@ def require_plausible_travel(loading: Loading, scene: Scene) -> None:
     travel, side = float(loading.travel().max()), rest_of(scene.sheet).extent
     if travel > 10 * side:
         fault = f"depth: the tool travels {travel:.4g} m, and the sheet is {side:g} m long"
-        remedy = "write the unit in the header, such as [mm], or in --columns 'depth=NAME, mm'"
+        name = loading.test.columns[1].choice if loading.test.columns else "NAME"
+        remedy = f'write the unit in the header, such as [mm], or give it by --columns "depth={name}, mm"'
         raise SceneError([f"{loading.test.name}: {fault}; {remedy}"])
 
 

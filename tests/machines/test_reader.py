@@ -15,7 +15,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from taichi_msm.cli.main import options
+import taichi_msm.cli.main  # noqa: F401  # registers the commands
+from taichi_msm.cli.options import program
 from taichi_msm.errors import SceneError
 from taichi_msm.fitting.machine_model import is_table
 from taichi_msm.machines.reader import MachineTest, cut_window, read_machine_test
@@ -231,7 +232,7 @@ def test_documented_commands(tmp_path: Path, save: Callable[..., Path]) -> None:
     names = set()
     for command in commands:
         name, *arguments = shlex.split(command)
-        given = options.program.commands[name].make_context(name, arguments).params
+        given = program.commands[name].make_context(name, arguments).params
         names.add(given["observed"])
         assert is_table(given["observed"])
         path = tmp_path / given["observed"]
