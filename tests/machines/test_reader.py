@@ -8,7 +8,7 @@ import shlex
 from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import replace
-from datetime import datetime
+from datetime import datetime, time
 from pathlib import Path
 from typing import Any
 
@@ -550,6 +550,13 @@ def test_workbook(save: Save, message: Messages) -> None:
     shifted.insert(8, [None] * 6 + ["a note"])
     path = save({"FF2": shifted}, put("XFD1048576", 1))
     assert_is_test(read_machine_test(path.rename(path.with_suffix(".XLSX"))))
+
+
+def test_clock_times_of_a_workbook(save: Save) -> None:
+    cells = [[time(9, 0, n // 10, n % 10 * 100_000), *row[1:]] for n, row in enumerate(SHEET[3:])]
+    test = read_machine_test(save({"FF2": [*SHEET[:3], *cells]}))
+    # Excel keeps times as shares of a day, with 15 digits; clock times have microseconds.
+    np.testing.assert_allclose(test.time, 32400 + TIME, atol=1e-6)
 
 
 def test_chosen_sheet_and_block(save: Save, message: Messages) -> None:
