@@ -11,6 +11,7 @@ import click
 
 from taichi_msm.cli import common, options
 from taichi_msm.errors import DivergedError
+from taichi_msm.system.process import write_stderr
 
 
 @options.program.command()
@@ -47,6 +48,13 @@ from taichi_msm.errors import DivergedError
     multiple=True,
     help="Of tables: depth at contact [m], one for all or each.",
 )
+@click.option(
+    "--force-offset",
+    type=float,
+    metavar="FORCE",
+    multiple=True,
+    help="Of tables: exact force without contact [N], one for all or each.",
+)
 @options.out_option("Directory for the fit.", "output/<name of the scene file>-fit")
 @options.workers_option(help="Number of worker processes.  [default: chosen by the duration of the first run]")
 @options.json_option
@@ -65,8 +73,8 @@ def fit(
 ) -> int:
     """Estimate parameters of SCENE from OBSERVED data, with confidence intervals.
 
-    OBSERVED: positions or pixels of points, an .npz; or one or more tables of a testing machine, .csv, .tsv, .txt or
-    .xlsx, with time, depth and force.
+    OBSERVED: positions or pixels of points, an .npz; or one or more tables of a testing machine, .csv, .tsv, .txt,
+    .dat, .lvm or .xlsx, with time, depth and force.
     """
     from taichi_msm.fitting.machine_model import is_table
     from taichi_msm.load.scene_file import load_scene
@@ -95,6 +103,7 @@ def fit(
                 window=None if window is None else parse_window(window),
                 directory=directory,
                 progress=progress,
+                report=lambda note: None if as_json else write_stderr([note]),
                 **settings,
             )
     except DivergedError as error:

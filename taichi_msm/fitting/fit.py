@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import replace
 from pathlib import Path
@@ -24,8 +24,9 @@ from taichi_msm.fitting.least_squares import Misfit, Search, Solution
 from taichi_msm.fitting.machine_curve import CurveRuns, has_curve, search_by_curve
 from taichi_msm.fitting.machine_fit import FittedTest, contact_notes, explanations, fitted_tests, unknown_notes
 from taichi_msm.fitting.machine_model import TABLE_OPTIONS, MachineProblem, read_machine_problem, table_paths
+from taichi_msm.fitting.machine_units import unit_notes
 from taichi_msm.fitting.observation import ErrorCorrelation, Observation
-from taichi_msm.fitting.outliers import LeftOut, leave_out
+from taichi_msm.fitting.outliers import LeftOut, leave_out, outlier_notes
 from taichi_msm.fitting.parameters import (
     Bounds,
     Method,
@@ -64,6 +65,7 @@ def fit(
     directory: str | Path | None = None,
     workers: int | None = None,
     progress: StageProgressCallback = lambda stage, done, total: None,
+    report: Callable[[str], None] = lambda note: None,
     **method: Unpack[Method],
 ) -> FitResult:
     """Estimate parameters of a scene from observations, with confidence intervals.
@@ -73,8 +75,8 @@ def fit(
         observed: an .npz file, or a mapping of arrays: `time` [s], shape (T,); `coordinates` of points, across and
             down, shape (N, 2); `position` [m], shape (N, T, 3), or `pixel` [px] of the scene's camera, shape (N, T, 2),
             NaN where not observed; optionally `sigma`, the standard deviation of their errors. Or a run's
-            trajectory.npz or tracks.npz. Or one or more tables of a testing machine, .csv, .tsv, .txt or .xlsx, with
-            time, depth and force, which the scene's only position-controlled tool follows.
+            trajectory.npz or tracks.npz. Or one or more tables of a testing machine, .csv, .tsv, .txt, .dat, .lvm or
+            .xlsx, with time, depth and force, which the scene's only position-controlled tool follows.
         free: keys of the parameters, dotted paths such as tissue.young or probes.0.total.2. tissue.map is a map of
             R x R cells; with it one component of a force may be free, and its factor then scales all forces. contact,
             or contact.0, ... of several tables, is the depth of contact [m of the table].
@@ -84,12 +86,14 @@ def fit(
         workers: number of worker processes; by default chosen by the duration of the first run.
         progress: callback for the stage, the number of finished runs and the expected number; an exception from it
             ends the fit without files.
+        report: callback for the warnings that are known before the search.
         **method: options. Of all fits of numbers: `robust` (without outliers), `profile` (profile-likelihood
             intervals of all parameters). Of points: `sigma` (standard deviation of the errors, replaces that of the
             file), `correlation` (correlation length of the errors of tracks [px]), `drift` (correlation time of the
             errors of a track [s]), `resolution` (R of a map). Of tables: `columns` (selected columns, such as
             ["depth=Traverse, mm"]), `sheet` and `block` of a file, `window` (first and last time [s]), `rate` (frames
-            per second), `contact` (depths of contact [m of the table], one for all tables or one each).
+            per second), `contact` (depths of contact [m of the table], one for all tables or one each),
+            `force_offset` (exact forces without contact [N], likewise, positive along the largest force).
 
     Returns:
         The estimates; `identifiable` is False if the data do not determine a parameter.
@@ -119,6 +123,8 @@ def fit(
     request, settings = Request(initial, free, bounds or {}, forces, method), None
     if tables := table_paths(observed):
         problem: FitProblem = read_machine_problem(tables, request)
+        for note in (note for loading in problem.tests for note in loading.test.notes):
+            report(note)
     else:
         problem, settings = _read_problem(observed, request)
     with ExitStack() as stack:
@@ -133,7 +139,7 @@ def fit(
         else:
             kind = CurveRuns if has_curve(problem) else Runs
             runs = stack.enter_context(kind(problem, workers, progress))
-            result = _fit(runs, initial, method)
+            result = _fit(runs, initial, method, report)
         result = replace(result, seconds=time.perf_counter() - start)
         if directory is not None:
             progress("write", 0, 0)
@@ -148,7 +154,7 @@ def _read_problem(observed: Any, request: Request) -> tuple[FitProblem, MapSetti
     points = points.with_sigma(method.get("sigma"))
     points = points.on_sheet(initial)
     if unused := [name for name in TABLE_OPTIONS if method.get(name)]:
-        raise SceneError([f"--{unused[0]}: only for tables of a testing machine; leave it out"])
+        raise SceneError([f"--{unused[0].replace('_', '-')}: only for tables of a testing machine; leave it out"])
     settings = map_settings(request)
     options = {"forces": forces, **{name: method.get(name) for name in ("robust", "profile", "correlation", "drift")}}
     if settings is not None and (conflicting := [name for name, value in options.items() if value]):
@@ -168,7 +174,7 @@ def _read_problem(observed: Any, request: Request) -> tuple[FitProblem, MapSetti
     return FitProblem(without_outputs(initial), parameters, observations), settings
 
 
-def _fit(runs: Runs, scene: Scene, method: Method) -> FitResult:
+def _fit(runs: Runs, scene: Scene, method: Method, report: Callable[[str], None]) -> FitResult:
     parameters, observations = runs.problem.parameters, runs.problem.observations
     error_correlation = ErrorCorrelation(method.get("correlation"), method.get("drift"))
     start = np.zeros(len(parameters))
@@ -183,6 +189,9 @@ def _fit(runs: Runs, scene: Scene, method: Method) -> FitResult:
         messages += unit_faults(observations, initial)
     if messages:
         raise SceneError(messages)
+    early_notes = list(unit_notes(machine, initial.values[0])) if machine else []
+    for note in early_notes:
+        report(note)
     signals = [observed.signal(scene) or 1.0 for observed in observations]
     misfit = Misfit(observations, signals, robust=method.get("robust", False))
     if isinstance(runs, CurveRuns):
@@ -227,6 +236,7 @@ def _fit(runs: Runs, scene: Scene, method: Method) -> FitResult:
         summaries |= observed.summary((predicted - observed.values)[observed.known], sigma)
     has_sigma = all(observed.sigma is not None for observed in observations)
     notes = [*unit_faults(observations, initial), *(note for fitted in tests for note in fitted.loading.test.notes)]
+    notes += early_notes
     notes += search_notes(solution, parameters, fits_well=search.fits_well(solution))
     notes += uncertainty_notes(parameters, solution.x, uncertainties, shifts, unidentified)
     if isinstance(runs, CurveRuns):
@@ -235,6 +245,8 @@ def _fit(runs: Runs, scene: Scene, method: Method) -> FitResult:
     notes += unknown_notes(tests, {key: values[key] for key, each in estimates.items() if not each.identifiable})
     if rejection_reason:
         notes += explanations(tests, fits_contact=any(key.startswith("contact") for key in values))
+    if not misfit.robust and not left_out:
+        notes += outlier_notes(uncertainties.residuals)
     if uncertainties.factor > 1.5:
         factor = rounded(math.sqrt(uncertainties.factor))
         notes.append(f"the residual is {factor} times sigma, and the intervals are widened by this factor")

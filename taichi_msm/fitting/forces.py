@@ -145,7 +145,7 @@ def read_forces(path: str | Path, sigma: float, probe_count: int) -> ToolForces:
     if row_units[0].isalpha() and row_units[0].lower() != "nan":
         _require_units(grid.place(rows.pop(0)), row_units)
     for n in rows:
-        grid.require_width(n, header)
+        grid.require_width(n, names)
         if (count := grid.counts[n]) < len(names):
             fault = f"{count} of {len(names)} cells, separated by {grid.separator}"
             remedy = "complete the row, with nan where not measured, or delete it"
@@ -159,7 +159,7 @@ def read_forces(path: str | Path, sigma: float, probe_count: int) -> ToolForces:
             raise SceneError([f"{grid.place(n)}: {grid.rows[header][column]}: {text[:40]!r}, {fault}; {remedy}"])
     table, row_index = np.full((len(rows), len(columns)), np.nan), {n: index for index, n in enumerate(rows)}
     remedy = "take a number, or leave the cell empty if not measured"
-    for (n, column), (value, _) in zip(cells, grid.numbers(header, cells, remedy), strict=True):
+    for (n, column), (value, _) in zip(cells, grid.numbers(grid.rows[header], cells, remedy), strict=True):
         table[row_index[n], columns.index(column)] = value
     time, probe, force = table[:, 0], table[:, 1], table[:, 2:]
     for key, values in (("time", time), ("probe", probe)):

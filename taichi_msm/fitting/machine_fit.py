@@ -14,6 +14,7 @@ from taichi_msm.fitting.machine_model import MachineProblem
 from taichi_msm.fitting.parameters import Parameter, rounded
 from taichi_msm.fitting.uncertainty import Uncertainty
 from taichi_msm.machines.loading import CONTACT_NOISES, Loading
+from taichi_msm.machines.reader import TORE
 
 # Largest change of the depth while the tool is held, as a share of the travel.
 HELD_SHARE = 0.02
@@ -73,10 +74,11 @@ def fitted_tests(
         # Residuals r of informative frames lack the offset.
         frame = int(np.argmax(loading.information > 0))
         residual = loading.sigma[frame] * uncertainties.residuals[frames][frame]
-        offset = float(residual - (force - loading.force)[frame])
+        offset = 0.0 if loading.has_exact_offset else float(residual - (force - loading.force)[frame])
         mean_slopes = weights @ slopes[frames] / weights.sum()
         by_parameters = float(np.linalg.norm(mean_slopes @ uncertainties.root))
         error = math.hypot(math.sqrt(uncertainties.factor / weights.sum()), by_parameters)
+        error = 0.0 if loading.has_exact_offset else error
         tests.append(FittedTest(loading.without_offset(offset), values.get(key, loading.contact), force, error))
     return tuple(tests)
 
@@ -116,7 +118,10 @@ def unknown_notes(tests: Sequence[FittedTest], values: Mapping[str, float]) -> I
             if value > reach:
                 yield f"{key}: {value:.2g} m is beyond the depth reached, {reach:.2g} m; press deeper, or leave it out"
         elif key == "tissue.stiffening.lock":
-            yield f"{key}: the test does not stretch the tissue far enough; pull further, or leave it out"
+            reason = "the test does not stretch the tissue far enough; pull further, or leave it out"
+            if any(TORE in note for fitted in tests for note in fitted.loading.test.notes):
+                reason = f"{TORE}, which the model does not describe; cut the table there by --window"
+            yield f"{key}: {reason}"
 
 
 def explanations(tests: Sequence[FittedTest], *, fits_contact: bool) -> Iterator[str]:

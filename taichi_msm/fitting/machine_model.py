@@ -25,15 +25,13 @@ from taichi_msm.machines.loading import (
     late_contact_note,
     require_plausible_travel,
 )
-from taichi_msm.machines.reader import cut_window, read_machine_test
+from taichi_msm.machines.reader import TABLE_SUFFIXES, cut_window, read_machine_test
 from taichi_msm.model.plan import Plan
 from taichi_msm.runs.simulation import Simulation
 from taichi_msm.scene.scene import Scene
 
-TABLE_SUFFIXES = (".csv", ".tsv", ".txt", ".xlsx")
-
 # Options of `fit` for tables only, and for observed points only.
-TABLE_OPTIONS = ("columns", "sheet", "block", "window", "rate", "contact")
+TABLE_OPTIONS = ("columns", "sheet", "block", "window", "rate", "contact", "force_offset")
 POINT_OPTIONS = ("sigma", "correlation", "drift", "resolution")
 
 
@@ -42,7 +40,7 @@ class MachineForces(Forces, ObservationModel):
     """Forces along the tool's direction [N] of all tests; values of shape (frames of all tests, 1).
 
     The observation is its own model: the map from the run of a test to these forces. The force of every test has an
-    unknown offset.
+    unknown offset, unless it is given.
     """
 
     is_independent: ClassVar[bool] = False  # Their chi-square is the total.
@@ -52,7 +50,9 @@ class MachineForces(Forces, ObservationModel):
 
     @property
     def freedom(self) -> int:
-        return round(sum(float(loading.information.sum()) for loading in self.tests)) - len(self.tests)
+        return round(sum(float(loading.information.sum()) for loading in self.tests)) - sum(
+            not loading.has_exact_offset for loading in self.tests
+        )
 
     @property
     def sigma_freedom(self) -> float:
@@ -64,6 +64,9 @@ class MachineForces(Forces, ObservationModel):
         for part, loading in zip(np.split(rows, ends), self.tests, strict=True):
             unit = (loading.information > 0) / loading.sigma
             part = (part.T * (unit > 0)).T
+            if loading.has_exact_offset:
+                parts.append(part)
+                continue
             centred = part - np.multiply.outer(unit, unit @ part / (unit @ unit))
             if robust_factor is not None:
                 for _ in range(20):  # reweighted means
@@ -167,20 +170,22 @@ def read_machine_problem(paths: Sequence[str], request: Request) -> MachineProbl
         raise SceneError([f"--forces: {paths[0]} contains forces already; leave the option out"])
     if unused := [name for name in POINT_OPTIONS if method.get(name) is not None]:
         raise SceneError([f"--{unused[0]}: only for observed points, and {paths[0]} has none; leave the option out"])
-    rate, contacts = method.get("rate"), list(method.get("contact") or ())
+    rate = method.get("rate")
     if rate is not None and not 0 < rate < np.inf:
         raise SceneError([f"--rate {rate:g}: take a number of frames per second, above 0"])
-    if len(contacts) not in (0, 1, len(paths)):
-        raise SceneError([f"--contact: {len(contacts)} depths for {len(paths)} tables; give one, or one per table"])
+    contacts = _per_table("--contact", "depths", method.get("contact"), len(paths))
+    offsets = _per_table("--force-offset", "forces", method.get("force_offset"), len(paths))
     approach, tests = find_approach(scene), []
     for n, (path, key) in enumerate(zip(paths, contact_keys(len(paths)), strict=True)):
         test = read_machine_test(path, method.get("columns") or (), method.get("sheet"), method.get("block"))
         if (window := method.get("window")) is not None:
             test = cut_window(test, *window)
-        contact = contacts[n if len(contacts) > 1 else 0] if contacts else None
-        loading = build_loading(test, scene, rate, contact, is_clamp=approach.is_clamp)
+        contact, is_clamp = contacts[n], approach.is_clamp
+        loading = build_loading(
+            test, scene, rate, contact, is_clamp=is_clamp, force_offset=offsets[n], fits_contact=key in free
+        )
         require_plausible_travel(loading, scene)
-        is_estimated = contact is None and not approach.is_clamp and key not in free
+        is_estimated = contact is None and not is_clamp and key not in free
         if is_estimated and (note := late_contact_note(loading, key)):
             loading = replace(loading, test=replace(loading.test, notes=(*loading.test.notes, note)))
         tests.append(loading)
@@ -200,6 +205,14 @@ def read_machine_problem(paths: Sequence[str], request: Request) -> MachineProbl
         fault = f"frames with rows: {count}, too few for {len(parameters)} parameters and the offset of the force"
         raise SceneError([f"{observations.name}: {fault}; raise --rate"])
     return MachineProblem(Scene(**placed), parameters, (observations,), tuple(tests), approach=approach)
+
+
+def _per_table(option: str, noun: str, given: Sequence[float] | None, count: int) -> list[float | None]:
+    """Return the number of every table, from one for all, one each, or none."""
+    numbers: list[float | None] = [*given] if given else [None]
+    if len(numbers) not in (1, count):
+        raise SceneError([f"{option}: {len(numbers)} {noun} for {count} tables; give one, or one per table"])
+    return numbers * count if len(numbers) == 1 else numbers
 
 
 def _make_parameters(request: Request, tests: Sequence[Loading], probe: int) -> tuple[Parameter, ...]:

@@ -8,6 +8,7 @@ are left out: the loss is min(r^2, limit). Gross outliers have no weight, 99.9 %
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any
 
@@ -27,6 +28,10 @@ MAX_FITS = 10
 
 # Smallest limit, as a share of the motion or force: residuals of exact observations are not normal.
 MIN_SHARE = 1e-4
+
+
+# Largest share of the values that are a few, and smallest share of chi-square that they carry.
+MAX_FEW, MIN_CARRIED = 0.3, 0.9
 
 
 @dataclass(frozen=True, eq=False)
@@ -69,6 +74,19 @@ def leave_out(search: Search, solution: Solution) -> tuple[Solution, list[LeftOu
     assert left_out is not None
     masks = zip(everything.observations, left_out, strict=True)
     return solution, [LeftOut(each.noun, mask, int(each.known.any(axis=-1).sum())) for each, mask in masks]
+
+
+def outlier_notes(residuals: Array) -> Iterator[str]:
+    """Yield a warning if a few residuals of a fit by least squares, shape (known,), carry chi-square."""
+    from scipy.stats import chi2
+
+    squares = residuals**2
+    # 1.4826 converts the median magnitude of normal errors to sigma.
+    is_outlier = squares > chi2.isf(PROBABILITY, 1) * 1.4826**2 * np.median(squares)
+    carried = float(squares[is_outlier].sum() / max(squares.sum(), 1e-300))
+    if is_outlier.mean() <= MAX_FEW and carried >= MIN_CARRIED:
+        shares = f"{is_outlier.sum()} of {len(squares)} values carry {rounded(100 * carried)} % of chi-square"
+        yield f"{shares}: if they are outliers, --robust reduces their weight or leaves them out"
 
 
 def _find(observed: Observation, predicted: Array, signal: float) -> NDArray[np.bool_]:

@@ -224,6 +224,7 @@ class Method(TypedDict, total=False):
     window: tuple[float, float] | None
     rate: float | None
     contact: Sequence[float] | None
+    force_offset: Sequence[float] | None
 
 
 class Request(NamedTuple):
@@ -309,4 +310,5 @@ _TYPES: dict[str, tuple[Check, str]] = {
     "window": (_is_pair(_is_number), "the first and the last time in seconds, such as (0.5, 12)"),
     "rate": (_is_number, "a number of frames per second, or None"),
     "contact": (_is_list(_is_number), "a list of depths in metres, such as [0.002]"),
+    "force_offset": (_is_list(_is_number), "a list of forces in newtons, such as [0.05]"),
 }

@@ -198,7 +198,8 @@ class FitResult:
             share = rounded(100 * fitted.residual / peak)
             residual = f"{fitted.residual:.3g} N, {share} % of the peak, at {frames} frames"
             noise = f"noise of the first {fitted.loading.test.noise_rows} rows {fitted.loading.noise:.2g} N"
-            offset = f"offset {fitted.loading.offset:.3g} +- {rounded(fitted.offset_error)} N subtracted"
+            error = "N, as given," if fitted.loading.has_exact_offset else f"+- {rounded(fitted.offset_error)} N"
+            offset = f"offset {fitted.loading.offset:.3g} {error} subtracted"
             details = f"{noise}, {offset}, contact at {1000 * fitted.contact:.4g} mm"
             lines.append(f"{fitted.loading.test.name}: residual {residual}; {details}{chi_text}")
         if not self.tests:
@@ -224,6 +225,7 @@ def _format_estimate(estimate: Estimate) -> str:
         return "?" if number is None else f"{float(f'{number:.{min(max(digits, 2), 9)}g}'):.10g}"
 
     low, high = map(written, estimate.interval)
-    error_text = "?" if error > 1000 * max(abs(estimate.value), abs(estimate.start)) else rounded(error)
+    is_vague = not estimate.identifiable and error > 1000 * max(abs(estimate.value), abs(estimate.start))
+    error_text = "?" if is_vague else rounded(error)
     suffix = "" if estimate.identifiable else ": not identifiable"
     return f"{written(estimate.value)} +- {error_text}, 95 % {low} to {high}, from {estimate.start:.6g}{suffix}"

@@ -1,6 +1,6 @@
 """Cells of tables, reader of text tables, and parser of numbers.
 
-Texts are UTF-8, UTF-16 or Windows-1252; their separator is detected from the header.
+Texts are UTF-8, UTF-16 or Windows-1252; their separator is detected from the header, or without one from the numbers.
 """
 
 from __future__ import annotations
@@ -11,6 +11,7 @@ import re
 from collections.abc import Callable, Iterable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
+from itertools import islice, pairwise
 from pathlib import Path
 
 from taichi_msm.errors import SceneError
@@ -30,12 +31,22 @@ SEPARATORS = {"tabs": "\t", "semicolons": ";", "commas": ",", "bars": "|", "wide
 # Patterns of the spaces between titles; a single space before a unit in brackets does not separate.
 SPACES = {"wide spaces": re.compile(r"\s{2,}"), "spaces": re.compile(r"\s+(?![\[(])")}
 
+# Gap between cells; sign of a comment with a label, as in # columns: height vDeflection; quoted and other cells.
+GAP, COMMENT = re.compile(r"\S\s{2,}\S"), re.compile(r"\s*[#%]+\s*(?:\w+:\s)?")
+QUOTED = re.compile(r'"([^"]*)"|(\S+)')
+
+# Lines and columns that may show the separator of numbers.
+MAX_NUMBER_LINES, MAX_NUMBER_COLUMNS = 1000, 1000
+
 LINE_END = re.compile(r"\r\n|\r|\n")
 
 # Letter other than e, which numbers contain.
 LETTER = re.compile(r"[^\W\d_eE]")
 
 NUMBER_PATTERN = re.compile(r"[+-]?(?:\d+(?:\.(\d*))?|\.(\d+))(?:[eE]([+-]?\d{1,3}))?", re.ASCII)
+
+# Clock times hh:mm:ss.fff.
+CLOCK = re.compile(r"(\d{1,4}):([0-5]?\d):([0-5]?\d(?:[.,]\d+)?)", re.ASCII)
 
 # Numbers with grouped thousands, 1,234.5 and 1.234,5, by decimal mark.
 GROUPS = {
@@ -84,26 +95,29 @@ class Grid:
         is_comment = not self.sheet and cells[:1] and cells[0].startswith(("#", "%"))
         return not is_comment and any(character.isalnum() for cell in cells for character in cell)
 
-    def require_width(self, row: int, header: int) -> None:
+    def require_width(self, row: int, names: Row) -> None:
         """Raise a SceneError if a row of a text is longer than its header."""
-        cells, names = self.rows[row], self.rows[header]
+        cells = self.rows[row]
         if not self.sheet and len(cells) > len(names):
             is_decimal = self.separator == "commas"
             remedy = "with decimal commas, separate cells by semicolons" if is_decimal else "name each column"
             fault = f"{len(cells)} cells separated by {self.separator}, but {len(names)} columns in the header"
             raise SceneError([f"{self.place(row)}: {fault}; {remedy}"])
 
-    def numbers(self, header: int, cells: Iterable[tuple[int, int]], remedy: str) -> list[tuple[float, int]]:
+    def numbers(
+        self, names: Row, cells: Iterable[tuple[int, int]], remedy: str, clock: int | None = None
+    ) -> list[tuple[float, int]]:
         """Return the number of every cell (row, column), with the power of its last digit, as `parse_number` does.
 
-        Raise a SceneError for a cell that is not a number, with the given remedy, or when decimal marks differ.
+        A column `clock` may have clock times. Raise a SceneError for a cell that is not a number, with the given
+        remedy, or when decimal marks differ.
         """
         numbers, known_mark = [], ""
         for row, column in cells:
             cell = self.rows[row][column]
-            number, mark = parse_number(cell), decimal_mark(cell)
+            number, mark = parse_number(cell) or (parse_clock(cell) if column == clock else None), decimal_mark(cell)
             if number is None or (mark and known_mark not in ("", mark)):
-                where = f"{self.place(row, column)}: {self.rows[header][column]}: {cell[:40]!r}"
+                where = f"{self.place(row, column)}: {names[column]}: {cell[:40]!r}"
                 if number is not None:
                     where, remedy = f"{where}; the table has both . and , as decimal marks", "take one"
                 elif cell.startswith("="):
@@ -116,7 +130,8 @@ class Grid:
 
 def read_text(name: str, is_header: Callable[[Row], bool], expected: str) -> Grid:
     """Return the cells of a text table; the separator is one that splits a line into a header."""
-    rows, counts, separator, numbers_row, numbers = [], [], "", -1, dict[str, list[bool]]()
+    rows, counts, separator = list[Row](), list[int](), ""
+    numbers_row, numbers = -1, dict[str, list[bool]]()
     data = read_bytes(name, expected)
     if (count := max(data.count(b"\n"), data.count(b"\r"))) > MAX_LINES:
         raise SceneError([f"{name}: {count:,} lines, above {MAX_LINES:,}; delete lines without cells"])
@@ -131,10 +146,20 @@ def read_text(name: str, is_header: Callable[[Row], bool], expected: str) -> Gri
                 numbers_row, numbers = _find_numbers(lines, n + 1)
             # The first separator that splits the next line of numbers into at least three, or else the first one.
             suitable = (key for key, row in headers.items() if sum(numbers[key][: len(row)]) >= 3)
-            separator = next(suitable, next(iter(headers)))
-        cells = headers[separator] if headers else _split_line(line, separator) if line else []
+            is_first, separator = not separator, next(suitable, next(iter(headers)))
+            if is_first:
+                rows, counts = _split_lines(lines[:n], n, separator)  # Units may be above the names.
+        if headers:
+            cells = headers[separator]
+        elif separator in SPACES and n < numbers_row and COMMENT.match(line):
+            cells = _split_header(line, separator)  # units
+        else:
+            cells = _split_line(line, separator) if line else []
         rows.append(_strip(cells))
         counts.append(len(cells))
+    if not separator and (found := _find_separator(lines)):
+        first, separator = found
+        rows, counts = _split_lines(lines, first, separator)
     return Grid(name, "", rows, separator, counts)
 
 
@@ -150,6 +175,19 @@ def parse_number(cell: str) -> tuple[float, int] | None:
     if match_ is None or abs(value := float(match_[0])) > MAX_MAGNITUDE:
         return None
     return value, int(match_[3] or 0) - len(match_[1] or match_[2] or "")
+
+
+def parse_clock(cell: str) -> tuple[float, int] | None:
+    """Parse a clock time hh:mm:ss.fff, and return it as `parse_number` does [s]; None for other cells."""
+    if (match_ := CLOCK.fullmatch(cell)) is None:
+        return None
+    seconds = float(match_[3].replace(",", "."))
+    return 3600.0 * int(match_[1]) + 60.0 * int(match_[2]) + seconds, -max(0, len(match_[3]) - 3)
+
+
+def is_value(cell: str) -> bool:
+    """Return whether a cell is a number or a clock time."""
+    return parse_number(cell) is not None or CLOCK.fullmatch(cell) is not None
 
 
 def decimal_mark(cell: str) -> str:
@@ -170,12 +208,39 @@ def _find_numbers(lines: list[str], start: int) -> tuple[int, dict[str, list[boo
     found = (n for n in range(start, len(lines)) if lines[n].strip() and not LETTER.search(lines[n]))
     index = next(found, len(lines))
     line = lines[index] if index < len(lines) else ""
-    return index, {key: [parse_number(cell) is not None for cell in _split_line(line, key)] for key in SEPARATORS}
+    return index, {key: [is_value(cell) for cell in _split_line(line, key)] for key in SEPARATORS}
+
+
+def _find_separator(lines: list[str]) -> tuple[int, str] | None:
+    """Return the index of the first of two successive lines of at least three numbers each, and their separator."""
+    numbers = (n for n, line in enumerate(lines) if line.strip() and not LETTER.search(line))
+    for first, second in pairwise(islice(numbers, MAX_NUMBER_LINES)):
+        for key in SEPARATORS:
+            cells, below = (_strip(_split_line(lines[n], key)) for n in (first, second))
+            if 3 <= len(cells) == len(below) <= MAX_NUMBER_COLUMNS and all(map(is_value, (*cells, *below))):
+                return first, key
+    return None
+
+
+def _split_lines(lines: list[str], first: int, separator: str) -> tuple[list[Row], list[int]]:
+    """Return the cells of lines, and their counts; lines before the first one of numbers may be titles or units."""
+    rows = []
+    for n, line in enumerate(lines):
+        if n < first and LETTER.search(line):
+            by_spaces = "wide spaces" if GAP.search(line) else "spaces"
+            rows.append(_split_header(line, by_spaces if separator in SPACES else separator))
+        else:
+            rows.append(_split_line(line, separator) if line else [])
+    return [_strip(row) for row in rows], [len(row) for row in rows]
 
 
 def _split_header(line: str, separator: str) -> Row:
     """Split a line that may be a header."""
     if spaces := SPACES.get(separator):
+        if comment := COMMENT.match(line):
+            line = line[comment.end() :]
+            if separator == "spaces" and '"' in line:
+                return _strip([quoted or word for quoted, word in QUOTED.findall(line)])
         return _strip(spaces.split(line.replace('"', "").strip("#% \t")))
     return _strip(_split_line(line, separator))
 

@@ -39,6 +39,9 @@ NORMAL_FACTOR = 1.48
 # Smallest force in contact, in units of the noise.
 CONTACT_NOISES = 5.0
 
+# Largest range of the forces in the rows of the noise before contact, as a share of that of all forces.
+MAX_FIRST_SHARE = 0.3
+
 # Spacing of the points of a curved sheet at the first contact, in radii of the tool.
 MAX_SPACING_RADII = 1 / 16
 
@@ -141,6 +144,7 @@ class Loading:
     noise: float  # standard deviation of the force in the first rows [N]
     contact: float  # depth of contact, as in the table [m]
     finds_contact: bool  # whether the depth of contact is estimated from the noise
+    has_exact_offset: bool = False  # whether the offset is given, and not fitted
 
     @property
     def peak(self) -> float:
@@ -160,22 +164,36 @@ class Loading:
 
 
 def build_loading(
-    test: MachineTest, scene: Scene, rate: float | None = None, contact: float | None = None, *, is_clamp: bool = False
+    test: MachineTest,
+    scene: Scene,
+    rate: float | None = None,
+    contact: float | None = None,
+    *,
+    is_clamp: bool = False,
+    force_offset: float | None = None,
+    fits_contact: bool = False,
 ) -> Loading:
     """Return a machine test sampled at frames, with estimated noise and depth of contact.
 
     The default rate is 10 frames per second, or less for a long test; of equilibria without relaxation, frames are then
     equidistant in depth. The default depth of contact [m of the table] is estimated from the forces, for a clamp it is
-    the first depth.
+    the first depth. With `fits_contact` a test that begins in contact has it at first there, too. `force_offset` [N] is
+    exact, by default estimated.
     """
     first = test.force[: test.noise_rows]
-    offset = float(np.median(first))
-    noise = max(NORMAL_FACTOR * float(np.median(np.abs(first - offset))), test.digit)
+    median = float(np.median(first))
+    offset = median if force_offset is None else force_offset
+    if offset >= test.force.max():
+        limit = f"the largest force of the table is {test.force.max():.4g} N"
+        raise SceneError([f"--force-offset {offset:g}: {test.name}: {limit}; take the force without contact"])
+    noise = max(NORMAL_FACTOR * float(np.median(np.abs(first - median))), test.digit)
     test = replace(test, force=test.force - offset, time=test.time - test.time[0])
     peak, finds_contact = int(test.force.argmax()), contact is None and not is_clamp
     if contact is not None and not test.depth.min() <= contact < test.depth.max():
         limits = f"{test.depth.min():.4g} to {test.depth.max():.4g} m"
         raise SceneError([f"--contact {contact:g}: {test.name}: the depths of the table are {limits}"])
+    if contact is None and fits_contact and _begins_in_contact(test, noise, float(test.force.max())):
+        contact, finds_contact = float(test.depth[0]), False
     if contact is None:
         contact = float(test.depth[0 if is_clamp else _contact_row(test, noise, peak)])
     if test.depth[peak] <= contact:
@@ -184,7 +202,7 @@ def build_loading(
         remedy = "Choose another depth by --columns, or change its sign"
         raise SceneError([f"{test.name}: {fall} while {question} {remedy}"])
     if rate is None and scene.time.at_rest and not (scene.tissue and scene.tissue.relaxation):
-        frames, rate = _sample_in_depth(test, noise, contact, finds_contact=finds_contact)
+        frames, rate = _sample_in_depth(test, noise, contact, median - offset, finds_contact=finds_contact)
     else:
         rate = rate or min(FRAMES_PER_SECOND, MAX_FRAMES / float(test.time[-1]))
         time = np.arange(max(1, math.ceil(float(test.time[-1]) * rate - 1e-6)) + 1) / rate
@@ -196,7 +214,10 @@ def build_loading(
     # Rounding to a digit has a standard deviation of 12^(-1/2).
     least = max(test.digit / math.sqrt(12), FORCE_ACCURACY * float(frames.force.max()))
     sigma = np.maximum(deviation / np.sqrt(np.where(frames.rows > 0, frames.rows, 1.0)), least)
-    return Loading(test, rate, *frames[:3], sigma, freedom, information, offset, noise, contact, finds_contact)
+    is_exact = force_offset is not None
+    return Loading(
+        test, rate, *frames[:3], sigma, freedom, information, offset, noise, contact, finds_contact, is_exact
+    )
 
 
 def require_plausible_travel(loading: Loading, scene: Scene) -> None:
@@ -204,7 +225,8 @@ def require_plausible_travel(loading: Loading, scene: Scene) -> None:
     travel, side = float(loading.travel().max()), rest_of(scene.sheet).extent
     if travel > 10 * side:
         fault = f"depth: the tool travels {travel:.4g} m, and the sheet is {side:g} m long"
-        remedy = "write the unit in the header, such as [mm], or in --columns 'depth=NAME, mm'"
+        name = loading.test.columns[1].choice if loading.test.columns else "NAME"
+        remedy = f'write the unit in the header, such as [mm], or give it by --columns "depth={name}, mm"'
         raise SceneError([f"{loading.test.name}: {fault}; {remedy}"])
 
 
@@ -214,7 +236,8 @@ def _contact_row(test: MachineTest, noise: float, peak: int) -> int:
     row = int(without_force[-1]) if len(without_force) else 0
     if row == peak:
         fault = f"the force never exceeds 5 times its noise, {noise:.3g} N in the first {test.noise_rows} rows"
-        remedy = "give the depth by --contact if the tool touches from the start, or choose the force by --columns"
+        depth = "find the depth by --free contact, or give it by --contact, if the tool touches from the start"
+        remedy = f"{depth}, or choose the force by --columns"
         raise SceneError([f"{test.name}: {fault}; {remedy}, or cut the table by --window"])
     return row
 
@@ -224,17 +247,28 @@ def late_contact_note(loading: Loading, key: str) -> str | None:
 
     The noise of these rows is then too large, and the contact is found too late.
     """
-    from scipy.stats import kendalltau
-
-    test, count = loading.test, loading.test.noise_rows
-    significant = CONTACT_NOISES * loading.noise
-    correlation = kendalltau(test.depth[:count], test.force[:count]).statistic
-    # Ten independent rows have a rank correlation above 0.55 with a probability of 0.015.
-    if not (significant > 0.01 * loading.peak and correlation > 0.55):
+    test, significant = loading.test, CONTACT_NOISES * loading.noise
+    if not _begins_in_contact(test, loading.noise, loading.peak):
         return None
-    fault = f"the force rises within the first {count} rows, so its noise, {loading.noise:.3g} N, is too large"
+    fault = (
+        f"the force rises within the first {test.noise_rows} rows, so its noise, {loading.noise:.3g} N, is too large"
+    )
     effect = f"the tool touches before {1000 * loading.contact:.4g} mm, where the force is {significant:.3g} N"
     return f"{test.name}: {fault}: {effect}; find the depth by --free {key}, or give it by --contact"
+
+
+def _begins_in_contact(test: MachineTest, noise: float, peak: float) -> bool:
+    """Return whether the force rises significantly already in the rows of the noise, with the depth or in a step."""
+    from scipy.stats import kendalltau
+
+    first = test.force[: test.noise_rows]
+    # Rows of errors without a trend span at most some six standard deviations, and differ by 2^(1/2) of them.
+    extent, scatter = float(np.ptp(first)), NORMAL_FACTOR / math.sqrt(2) * float(np.median(np.abs(np.diff(first))))
+    if extent > MAX_FIRST_SHARE * float(np.ptp(test.force)) and extent > 10 * scatter:
+        return True
+    # Ten independent rows have a rank correlation above 0.55 with a probability of 0.015.
+    correlation = kendalltau(test.depth[: test.noise_rows], first).statistic
+    return CONTACT_NOISES * noise > 0.01 * peak and correlation > 0.55
 
 
 class _Frames(NamedTuple):
@@ -247,8 +281,13 @@ class _Frames(NamedTuple):
     information: Array  # `rows` as a share of all rows of the frame; 0 without rows
 
 
-def _sample_in_depth(test: MachineTest, noise: float, contact: float, *, finds_contact: bool) -> tuple[_Frames, float]:
-    """Sample a test at equidistant depths, up to the greatest one; return the frames, and their number per second."""
+def _sample_in_depth(
+    test: MachineTest, noise: float, contact: float, level: float, *, finds_contact: bool
+) -> tuple[_Frames, float]:
+    """Sample a test at equidistant depths, up to the greatest one; return the frames, and their number per second.
+
+    `level`: median force of the first rows [N].
+    """
     last = int(test.depth.argmax()) + 1
     deepest, share = float(test.depth[last - 1]), CONTACT_SHARE
     if finds_contact:
@@ -262,10 +301,11 @@ def _sample_in_depth(test: MachineTest, noise: float, contact: float, *, finds_c
     frames = _means(pressed.depth, depth, half, pressed)
     count = test.noise_rows
     if test.depth[:count].max() < depth[0] - 1.01 * half:
-        # The first rows, with a median of 0, belong to the first frame. The variance of a median is pi / 2 times that
+        # The first rows, with their median, belong to the first frame. The variance of a median is pi / 2 times that
         # of a mean.
         rows = frames.rows[0] + 2 / math.pi * count
-        frames.force[0] *= frames.rows[0] / rows
+        share = frames.rows[0] / rows
+        frames.force[0] = share * frames.force[0] + (1 - share) * level
         frames.rows[0] = rows
     return frames, DEPTH_FRAMES / max(float(test.time[last - 1]), 1e-3)
 

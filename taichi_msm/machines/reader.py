@@ -1,8 +1,4 @@
-"""Reader of machine tests: time, depth and force from a text table or a workbook.
-
-A block is a header, an optional row of units, and rows of numbers. A file may have several blocks, with other lines
-around them. Titles are recognised in English, French and German; --columns selects others.
-"""
+"""Reader of machine tests: time, depth and force from a text table or a workbook."""
 
 from __future__ import annotations
 
@@ -10,34 +6,32 @@ import math
 import re
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
-from functools import lru_cache
-from itertools import pairwise, product
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
 
 from taichi_msm.arithmetic import Array
 from taichi_msm.errors import SceneError, did_you_mean
-from taichi_msm.machines.cells import LETTER, WORKBOOK_SUFFIX, Grid, Row, parse_number, read_text
+from taichi_msm.machines.blocks import (
+    MAX_TITLE_LENGTH,
+    MIN_ROWS,
+    WORDS,
+    Block,
+    find_blocks,
+    find_blocks_of_numbers,
+    find_candidates,
+    is_header,
+)
+from taichi_msm.machines.cells import WORKBOOK_SUFFIX, Grid, parse_clock, parse_number, read_text
 from taichi_msm.machines.titles import UNITS, fold, split_choice, split_title, unit_factor
 from taichi_msm.machines.workbook import read_workbook
-
-# Smallest number of rows of a test, and of those that the noise of the force is estimated from.
-MIN_ROWS = 10
 
 # Clause of the note about torn tissue.
 TORE = "the tissue tore"
 
-EXPECTED = f"name a table of a testing machine: .csv, .tsv, .txt or {WORKBOOK_SUFFIX}"
-
-# Words for the quantities in titles, and endings of German compounds, such as Prüfzeit, Standardweg, Standardkraft.
-WORDS = {
-    "time": {"time", "temps", "zeit"},
-    "depth": {"depth", "displacement", "indentation", "extension", "elongation", "allongement", "stroke", "position"}
-    | {"travel", "distance", "weg"},
-    "force": {"force", "load", "fz", "kraft"},
-}
-ENDINGS = {"time": "zeit", "depth": "weg", "force": "kraft"}
+TABLE_SUFFIXES = (".csv", ".tsv", ".txt", ".dat", ".lvm", WORKBOOK_SUFFIX)
+EXPECTED = f"name a table of a testing machine: {', '.join(TABLE_SUFFIXES[:-1])} or {WORKBOOK_SUFFIX}"
 
 # Smallest ranges of a test, in SI units.
 MIN_RANGES = {"time": (1e-9, "s"), "depth": (1e-12, "m"), "force": (1e-15, "N")}
@@ -45,14 +39,24 @@ MIN_RANGES = {"time": (1e-9, "s"), "depth": (1e-12, "m"), "force": (1e-15, "N")}
 # Content of a table, for messages.
 CONTENT = "time, depth and force"
 
-# Longest title [characters].
-MAX_TITLE_LENGTH = 200
+# Number of rows that are searched for the titles of a faulty table.
+MAX_SHOWN_ROWS = 10_000
 
-# Words, and parts of a title in brackets.
-WORD, BRACKETS = re.compile(r"[^\W\d_]+"), re.compile(r"[(\[][^)\]]*[)\]]")
+# Titles that shells leave unchanged within double quotes.
+SAFE = re.compile(r"[\w .,:;/()\[\]°%#+-]+")
 
 # Start of a value, even an invalid one: a number, NaN, or an error or a formula of a workbook.
 VALUE_START = re.compile(r"[+\-\N{MINUS SIGN}]?[.,]?\d|[+-]?(nan|inf)|[#=]", re.ASCII | re.IGNORECASE)
+
+
+@dataclass(frozen=True)
+class Column:
+    """Column of a quantity: index, title, factor from its unit to SI, and its choice by --columns without the unit."""
+
+    index: int
+    title: str
+    scale: float
+    choice: str = ""
 
 
 @dataclass(frozen=True)
@@ -65,30 +69,12 @@ class MachineTest:
     force: Array  # forces [N], shape (n,), signed likewise
     digit: float  # resolution of the forces: their last digit in the file [N]
     notes: tuple[str, ...] = ()  # warnings about choices of the reader, and about the test
+    columns: tuple[Column, ...] = ()  # of time, depth and force
 
     @property
     def noise_rows(self) -> int:
         """Number of first rows, which the noise of the force is estimated from."""
         return max(MIN_ROWS, math.ceil(0.05 * len(self.force)))
-
-
-@dataclass(frozen=True)
-class _Block:
-    """Header, row of units, other rows with content, and row after the last, by index."""
-
-    header: int
-    units: int | None
-    rows: list[int]
-    end: int
-
-
-@dataclass(frozen=True)
-class _Column:
-    """Column of a quantity: index, title, and factor from its unit to SI."""
-
-    index: int
-    title: str
-    scale: float
 
 
 def read_machine_test(
@@ -102,23 +88,33 @@ def read_machine_test(
     name, chosen = str(path), parse_choices(columns)
     if name.lower().endswith(WORKBOOK_SUFFIX):
         sheets = read_workbook(name, EXPECTED)
-        tables = [title for title, each in sheets.items() if _find_blocks(each, chosen)]
+        tables = [title for title, each in sheets.items() if find_blocks(each, chosen)]
+        tables = tables or [title for title, each in sheets.items() if find_blocks_of_numbers(each, chosen)]
         grid = choose_sheet(name, sheets, sheet, tables)
     elif sheet is None:
-        grid = read_text(name, lambda row: _is_header(row, chosen), EXPECTED)
+        grid = read_text(name, lambda row: is_header(row, chosen), EXPECTED)
     else:
         raise SceneError([f"--sheet {sheet}: {name} is a text, without sheets; leave the option out"])
-    # A block of too few rows counts only if there is no other; `_read_block` then raises the error.
-    blocks = _find_blocks(grid, chosen) or _find_blocks(grid, chosen, min_rows=0)
-    if not blocks:
-        raise SceneError([_missing_header(grid, chosen)])
+    blocks = _require_blocks(grid, chosen)
     if block is None and len(blocks) > 1:
-        numbered = listed([f"{n} (rows {part.header + 1} to {part.end})" for n, part in enumerate(blocks, 1)])
+        numbered = listed([f"{n} ({part})" for n, part in enumerate(blocks, 1)])
         raise SceneError([f"{grid.title}: {len(blocks)} blocks of rows; choose one by --block: {numbered}"])
     if block is not None and not 1 <= block <= len(blocks):
         raise SceneError([f"--block {block}: {grid.title} has {len(blocks)}, numbered from 1"])
     test = _read_block(grid, blocks[(block or 1) - 1], chosen)
     return _orient(test if len(blocks) == 1 else replace(test, name=f"{test.name}, block {block}"))
+
+
+def _require_blocks(grid: Grid, chosen: dict[str, str]) -> list[Block]:
+    """Return the blocks of a table with all quantities; raise a SceneError without one."""
+    if not (blocks := find_blocks(grid, chosen)):
+        of_numbers = find_blocks_of_numbers(grid, chosen)
+        blocks = [block for block in of_numbers if all(block.candidates.values())]
+        # A block of too few rows counts only if there is no other; `_read_block` then raises the error.
+        blocks = blocks or find_blocks(grid, chosen, min_rows=0)
+        if not blocks:
+            raise SceneError([_missing_columns(grid, of_numbers[0] if of_numbers else None, chosen)])
+    return blocks
 
 
 def cut_window(test: MachineTest, start: float, end: float) -> MachineTest:
@@ -189,64 +185,14 @@ def listed(names: Sequence[str]) -> str:
     return ", ".join([*(name[:MAX_TITLE_LENGTH] for name in names[:50]), *more])
 
 
-def _find_blocks(grid: Grid, chosen: dict[str, str], min_rows: int = MIN_ROWS) -> list[_Block]:
-    """Find the blocks with at least `min_rows` rows of numbers; shorter ones are summaries."""
-    headers = [n for n, row in enumerate(grid.rows) if _is_header(row, chosen)]
-    blocks = []
-    for header, end in pairwise([*headers, len(grid.rows)]):
-        rows = [n for n in range(header + 1, end) if grid.has_content(n)]
-        candidates = _find_candidates(grid.rows[header], chosen)
-        first = rows[0] if rows else None
-        pairs = ((quantity, index) for quantity, columns in candidates.items() for index in columns)
-        has_units = any(unit_factor(quantity, grid.cell(first, index)) is not None for quantity, index in pairs)
-        units, rows = (first, rows[1:]) if has_units else (None, rows)
-        counts = [sum(parse_number(cell) is not None for cell in grid.rows[n]) for n in rows]
-        if sum(count >= len(WORDS) for count in counts) >= min_rows:
-            blocks.append(_Block(header, units, rows, end))
-    return blocks
-
-
-def _is_header(row: Row, chosen: dict[str, str]) -> bool:
-    """Return whether a row has a title of every quantity, each in its own cell."""
-    if len(row) < len(WORDS) or sum(bool(LETTER.search(cell)) for cell in row) < len(WORDS):
-        return False
-    candidates = _find_candidates(row, chosen).values()
-    return any(len({*columns}) == len(columns) for columns in product(*candidates))
-
-
-def _find_candidates(row: Row, chosen: dict[str, str]) -> dict[str, list[int]]:
-    candidates = {}
-    for quantity, title in chosen.items():
-        # Columns of the whole title, or else of its name without the unit.
-        name = fold(split_choice(title, quantity)[0])
-        same = [n for n, cell in enumerate(row) if fold(cell) == fold(title)]
-        candidates[quantity] = same or [
-            n for n, cell in enumerate(row) if name in (fold(cell), fold(split_title(cell, quantity)[0]))
-        ]
-    taken = {column for columns in candidates.values() for column in columns}
-    titles = [n for n, cell in enumerate(row) if n not in taken and 0 < len(cell) <= MAX_TITLE_LENGTH]
-    for quantity in WORDS.keys() - chosen.keys():
-        candidates[quantity] = [n for n in titles if quantity in _named_quantities(row[n])]
-    return {quantity: candidates[quantity] for quantity in WORDS}
-
-
-@lru_cache(10_000)
-def _named_quantities(title: str) -> frozenset[str]:
-    """Return the quantities whose words a title contains, outside brackets."""
-    # Without closing brackets, `BRACKETS` takes quadratic time.
-    end = max(title.rfind(")"), title.rfind("]")) + 1
-    words = WORD.findall((BRACKETS.sub(" ", title[:end]) + title[end:]).casefold())
-    by_ending = {quantity for quantity, ending in ENDINGS.items() if any(word.endswith(ending) for word in words)}
-    return frozenset(by_ending | {quantity for quantity, known in WORDS.items() if known & {*words}})
-
-
-def _read_block(grid: Grid, block: _Block, chosen: dict[str, str]) -> MachineTest:
+def _read_block(grid: Grid, block: Block, chosen: dict[str, str]) -> MachineTest:
     columns, notes = _select_columns(grid, block, chosen)
     rows = list(_rows_of_numbers(grid, block, columns))
     if len(rows) < MIN_ROWS:
         raise SceneError([f"{grid.place(block.header)}: {len(rows)} rows of numbers; a test has at least {MIN_ROWS}"])
     cells = [(row, column.index) for row in rows for column in columns]
-    parsed = grid.numbers(block.header, cells, "take a number, or delete the row")
+    clock = columns[0].index if parse_clock(grid.cell(rows[0], columns[0].index)) else None
+    parsed = grid.numbers(block.titles, cells, "take a number, or delete the row", clock)
     scales = np.array([column.scale for column in columns])
     time, depth, force = (np.array([value for value, _ in parsed]).reshape(-1, len(columns)) * scales).T.copy()
     if len(still := np.flatnonzero(np.diff(time) <= 0)):
@@ -260,77 +206,131 @@ def _read_block(grid: Grid, block: _Block, chosen: dict[str, str]) -> MachineTes
             remedy = f'choose another column or unit by --columns "{quantity}=NAME, UNIT"'
             raise SceneError([f"{grid.place(block.header, column.index)}: {column.title}: {fault}; {remedy}"])
     digit = 10.0 ** min(power for _, power in parsed[2 :: len(columns)]) * columns[2].scale
-    return MachineTest(grid.title, time, depth, force, digit, tuple(notes))
+    return MachineTest(grid.title, time, depth, force, digit, tuple(notes), tuple(columns))
 
 
-def _select_columns(grid: Grid, block: _Block, chosen: dict[str, str]) -> tuple[list[_Column], list[str]]:
+def _select_columns(grid: Grid, block: Block, chosen: dict[str, str]) -> tuple[list[Column], list[str]]:
     """Select the columns of time, depth and force, and collect notes.
 
     Of several candidates, the one nearest 0 in the first row is selected.
     """
-    header, titles = block.header, grid.rows[block.header]
+    header, titles = block.header, block.titles
     first = block.rows[0] if block.rows else None
 
-    def first_size(column: _Column) -> float:
+    def first_size(column: Column) -> float:
         number = parse_number(grid.cell(first, column.index))
         return math.inf if number is None else abs(number[0]) * column.scale
 
-    selected, notes = [], []
-    for quantity, candidates in _find_candidates(titles, chosen).items():
-        given, columns = split_choice(chosen.get(quantity, ""), quantity)[1], []
+    found, notes = dict[str, list[Column]](), []
+    given = {quantity: split_choice(chosen.get(quantity, ""), quantity)[1] for quantity in WORDS}
+    for quantity, candidates in block.candidates.items():
+        found[quantity] = []
         for index in candidates:
-            scale = unit_factor(quantity, grid.cell(block.units, index))
-            if scale is None:
-                scale = split_title(titles[index], quantity)[1]
-            if given is not None and scale not in (None, given):
+            scale = _file_scale(grid, block, quantity, index)
+            if given[quantity] is not None and scale not in (None, given[quantity]):
                 title = chosen[quantity]
                 notes.append(f"{grid.title}: {quantity} is read as {title!r}, although the file has another unit")
-            scale = scale if given is None else given
+            if quantity == "time" and parse_clock(grid.cell(first, index)):
+                scale = 1.0
+            scale = scale if given[quantity] is None else given[quantity]
             if scale is not None:
-                columns.append(_Column(index, titles[index], scale))
-        known = ", ".join(UNITS[quantity])
-        if not columns:
-            title = titles[candidates[0]]
-            fault = f'no unit of {quantity} ({known}); give it by --columns "{quantity}={title}, UNIT"'
-            raise SceneError([f"{grid.place(header, candidates[0])}: {title}: {fault}"])
+                found[quantity].append(Column(index, titles[index], scale))
+    if without_unit := [quantity for quantity, columns in found.items() if not columns]:
+        n = block.candidates[without_unit[0]][0]
+        listed_units = " and of ".join(f"{quantity} ({', '.join(UNITS[quantity])})" for quantity in without_unit)
+        options = " ".join(
+            _option(quantity, _choice(block, quantity, block.candidates[quantity][0])) for quantity in without_unit
+        )
+        raise SceneError([f"{grid.place(header, n)}: {titles[n]}: no unit of {listed_units}; give it by {options}"])
+    selected = []
+    for quantity, columns in found.items():
         best = min(columns, key=first_size)
         if (repeated := sum(column.title == best.title for column in columns)) > 1:
-            fault = f"{repeated} columns of this name; rename or delete all but one"
-            raise SceneError([f"{grid.place(header, best.index)}: {best.title}: {fault}"])
-        if best.index in grid.merged_columns(header):
+            fault = (
+                f"{repeated} columns of this name; choose one by its number, {_option(quantity, str(best.index + 1))}"
+            )
+            raise SceneError([f"{grid.place(header, best.index)}: {best.title}: {fault}, or rename the others"])
+        if block.has_titles and best.index in grid.merged_columns(header):
             raise SceneError([describe_merged(grid, header, best.index)])
         unit = grid.cell(block.units, best.index)
         title_scale, scale = split_title(best.title, quantity)[1], unit_factor(quantity, unit)
-        if given is None and unit and title_scale not in (None, scale):
+        is_below = block.units is not None and block.units > header
+        if given[quantity] is None and unit and title_scale not in (None, scale) and (is_below or scale):
             reason = f"not a unit of {quantity}; so it is in that of its title" if scale is None else "its unit"
-            notes.append(f"{grid.title}: {best.title!r}: {unit[:40]!r} in the row below is {reason}")
+            row = "below" if is_below else "above"
+            notes.append(f"{grid.title}: {best.title!r}: {unit[:40]!r} in the row {row} is {reason}")
         if others := [column.title for column in columns if column != best]:
             than = " and ".join(map(repr, others[:5]))
             notes.append(f"{grid.title}: {quantity} is {best.title!r}, as it starts nearer 0 than {than}")
-        selected.append(best)
+        selected.append(replace(best, choice=_choice(block, quantity, best.index)))
     return selected, notes
 
 
-def _missing_header(grid: Grid, chosen: dict[str, str]) -> str:
-    """Describe the fault of a table without a header."""
+def _file_scale(grid: Grid, block: Block, quantity: str, column: int) -> float | None:
+    """Return the factor of a column's unit in the file; None without a unit of the quantity."""
+    scale = unit_factor(quantity, grid.cell(block.units, column))
+    return split_title(block.titles[column], quantity)[1] if scale is None else scale
+
+
+def _choice(block: Block, quantity: str, column: int) -> str:
+    """Return the choice of a column: its title without unit, or its number if that is not unique, or not safe."""
+    names = [split_title(title, quantity)[0] for title in block.titles]
+    is_title = SAFE.fullmatch(names[column]) and sum(fold(name) == fold(names[column]) for name in names) == 1
+    return names[column] if is_title and block.has_titles else str(column + 1)
+
+
+def _option(quantity: str, choice: str, unit: str = "") -> str:
+    """Return the option for a column, by default with the usual unit."""
+    return f'--columns "{quantity}={choice}, {unit or next(iter(UNITS[quantity]))}"'
+
+
+def _missing_columns(grid: Grid, block: Block | None, chosen: dict[str, str]) -> str:
+    """Describe the fault of a table without titles of all quantities; the remedy names a column for each."""
     if not any(grid.rows):
         return f"{grid.title}: is empty; a table has columns of time, depth and force"
-    # Find the row with most quantities; a text without a header is not split yet.
-    cells = [row if grid.sheet else re.split(r"[\t;,|]", ";".join(row)) for row in grid.rows]
-    named = [{quantity for quantity, columns in _find_candidates(row, chosen).items() if columns} for row in cells]
+    # Find the row with most quantities; a text without a header or numbers is not split.
+    rows = grid.rows[: MAX_SHOWN_ROWS if block is None else block.rows[0] + 1]
+    cells = [row if grid.sheet else re.split(r"[\t;,|]", ";".join(row)) for row in rows]
+    named = [{quantity for quantity, columns in find_candidates(row, chosen).items() if columns} for row in cells]
     best = max(range(len(named)), key=lambda row: len(named[row]))
     if named[best] and (merged := grid.merged_columns(best)):
         return describe_merged(grid, best, min(merged))
-    shown = f"{grid.place(best)}: {', '.join(grid.rows[best])[:100]!r}"
-    missing = [quantity for quantity in WORDS if quantity not in named[best]]
-    if not missing:
-        return f"{shown} names time, depth and force in one cell; separate them"
-    quantity = missing[0] if named[best] else "depth"
-    known = ", ".join(UNITS[quantity])
-    remedy = f'choose columns by --columns "{quantity}=NAME, {next(iter(UNITS[quantity]))}" (units: {known})'
-    if not named[best]:
-        return f"{grid.title}: no row names time, depth and force; {remedy}"
-    return f"{shown} names no {repr(chosen[quantity]) if quantity in chosen else quantity}; {remedy}"
+    if len(named[best]) == len(WORDS):
+        return f"{_shown(grid, best)} names time, depth and force in one cell; separate them"
+    row, missing = best if named[best] else None, [quantity for quantity in WORDS if quantity not in named[best]]
+    options = [_option(quantity, "NAME") for quantity in missing]
+    if block is not None:
+        row = block.header if block.has_titles else None
+        missing = [quantity for quantity, columns in block.candidates.items() if not columns]
+        options = list(_guess(grid, block, missing))
+    *others, last = (repr(chosen[quantity]) if quantity in chosen else quantity for quantity in missing)
+    conjunction = " and " if row is None else " or "
+    names = conjunction.join([*([", ".join(others)] if others else []), last])
+    fault = f"{grid.title}: no row names {names}" if row is None else f"{_shown(grid, row)} names no {names}"
+    units = "; ".join(f"{quantity}: {', '.join(UNITS[quantity])}" for quantity in missing)
+    return f"{fault}; choose by title or number, such as {' '.join(options)} (units of {units})"
+
+
+def _shown(grid: Grid, row: int) -> str:
+    return f"{grid.place(row)}: {', '.join(grid.rows[row])[:100]!r}"
+
+
+def _guess(grid: Grid, block: Block, missing: list[str]) -> Iterator[str]:
+    """Yield an option for every missing quantity: a column of its unit, or else an unused one, for time increasing."""
+    used = {column for columns in block.candidates.values() for column in columns}
+    cells = [[grid.cell(row, n) for row in block.rows[:MIN_ROWS]] for n in range(len(block.titles))]
+    values = [[(parse_number(cell) or parse_clock(cell) or (math.nan,))[0] for cell in column] for column in cells]
+    for quantity in missing:
+        free = [n for n in range(len(values)) if n not in used and not any(map(math.isnan, values[n]))]
+        with_unit = [n for n in free if _file_scale(grid, block, quantity, n) is not None]
+        growing = [n for n in free if quantity == "time" and all(a < b for a, b in pairwise(values[n]))]
+        if not (best := [*with_unit, *growing, *free]):
+            yield _option(quantity, "NAME")
+            continue
+        used.add(best[0])
+        scale = _file_scale(grid, block, quantity, best[0])
+        unit = next((unit for unit, factor in UNITS[quantity].items() if factor == scale), "")
+        yield _option(quantity, _choice(block, quantity, best[0]), unit)
 
 
 def describe_merged(grid: Grid, row: int, column: int) -> str:
@@ -339,23 +339,24 @@ def describe_merged(grid: Grid, row: int, column: int) -> str:
     return f"{grid.place(row, column)}: {grid.rows[row][column]}: {fault}"
 
 
-def _rows_of_numbers(grid: Grid, block: _Block, columns: list[_Column]) -> Iterator[int]:
+def _rows_of_numbers(grid: Grid, block: Block, columns: list[Column]) -> Iterator[int]:
     """Yield the indices of the rows of numbers of a block, up to the first row of text.
 
     Raise a SceneError when a row has too few or too many cells, or numbers follow a row of text.
     """
-    indices, text, names = [column.index for column in columns], None, grid.rows[block.header]
+    indices, text, names = [column.index for column in columns], None, block.titles
     for n in block.rows:
         row = grid.rows[n]
         cells = [row[index] for index in indices if index < len(row)]
         is_complete = len(cells) == len(indices)
-        if is_complete and not any(cells):
+        # Tests in other groups of columns may be longer.
+        if (is_complete or block.group) and not any(cells):
             continue
         # A row of text may contain numbers: of a short row only the time decides, or else the first cell.
         if not any(map(VALUE_START.match, cells if is_complete else row[indices[0] :][:1] or row[:1])):
             text = n if text is None else text
         elif text is None:
-            grid.require_width(n, block.header)
+            grid.require_width(n, names)
             for column in columns:
                 if not grid.cell(n, column.index):
                     fault = "empty"

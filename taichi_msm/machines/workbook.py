@@ -263,7 +263,9 @@ def _format(value: str, kind: str, is_date: bool) -> str:
             raise ValueError
         if not is_date:
             return format(float(value), ".15g") if {*value} & {*".eE"} else str(int(value))
+        if 0 <= (day := float(value)) < 1:
+            time = (DAY_0 + datetime.timedelta(days=day)).time()
+            return time.isoformat("microseconds")  # a clock time
         with suppress(OverflowError):
-            date = DAY_0 + datetime.timedelta(seconds=round(86400 * float(value)))
-            value = str(date if float(value) >= 1 else date.time())
-    return f"a date or time of day, {value}" if is_date or kind == "d" else value
+            value = str(DAY_0 + datetime.timedelta(seconds=round(86400 * day)))
+    return f"a date, {value}" if is_date or kind == "d" else value

@@ -164,7 +164,7 @@ def _read_rows(grid: Grid, header: int, columns: dict[str, _Column]) -> Table:
         # Rows of units and remarks have no numbers.
         if not grid.has_content(n) or not any(map(VALUE_START.match, cells)):
             continue
-        grid.require_width(n, header)
+        grid.require_width(n, grid.rows[header])
         is_measured = all(grid.cell(n, column.index).casefold() not in ("", "nan") for column in of_force)
         (rows if is_measured else without_force).append(n)
         for column in [*([place] if place else []), *(columns.values() if is_measured else [])]:
@@ -229,7 +229,7 @@ def _read_numbers(
 ) -> tuple[dict[str, Array], float]:
     """Return the numbers of each column in SI units, and the last digit of the forces [N]."""
     cells = [(n, column.index) for n in rows for column in columns.values()]
-    parsed = grid.numbers(header, cells, "take a number, or delete the row")
+    parsed = grid.numbers(grid.rows[header], cells, "take a number, or delete the row")
     numbers, digit = {}, math.inf
     for k, (name, column) in enumerate(columns.items()):
         of_column = parsed[k :: len(columns)]

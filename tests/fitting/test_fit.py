@@ -25,6 +25,7 @@ from taichi_msm.fitting.fit import search_notes, uncertainty_notes
 from taichi_msm.fitting.forces import read_forces
 from taichi_msm.fitting.least_squares import Solution
 from taichi_msm.fitting.observation import ErrorCorrelation
+from taichi_msm.fitting.outliers import outlier_notes
 from taichi_msm.fitting.parameters import Method, make_parameters
 from taichi_msm.fitting.points import MIN_MOTION_SIGMAS, Pixels, PointObservation, Positions
 from taichi_msm.fitting.predict import FitProblem, ForwardModel, Prediction, Runs, without_outputs
@@ -587,6 +588,7 @@ INVALID_ARGUMENTS: dict[str, dict[str, Any]] = {
     "drift": {"drift": True},
     "resolution": {"resolution": 4.0},
     "columns": {"columns": "depth=Traverse, mm"},
+    "force offset": {"force_offset": 0.1},
     "sheet": {"sheet": 1},
     "block": {"block": "2"},
     "window": {"window": 12.0},
@@ -710,6 +712,17 @@ def test_units_and_signs_of_forces(tracks: Arrays, device: Device, tmp_path: Pat
     record = json.loads((tmp_path / "fit" / "fit.json").read_text())
     assert record["residual_force"] < record["sigma_force"] == 0.01
     assert (tmp_path / "fit" / "fit.png").stat().st_size > 10_000
+
+
+@pytest.mark.parametrize("share", [0.0, 0.01, 0.2, 0.5])
+def test_note_about_outliers(share: float, message: Messages) -> None:
+    """A few values carry chi-square; normal errors and half of the values do not."""
+    residuals = np.random.default_rng(2).normal(size=2000)
+    residuals[: round(2000 * share)] *= 100
+    notes = list(outlier_notes(residuals))
+    assert len(notes) == (0 < share < 0.3)
+    if notes:
+        message(notes, "--robust")
 
 
 @pytest.mark.parametrize("robust", [False, True])

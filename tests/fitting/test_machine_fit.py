@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -18,13 +19,14 @@ from taichi_msm.fitting.least_squares import Misfit, Solution
 from taichi_msm.fitting.machine_curve import CurveRuns, relax
 from taichi_msm.fitting.machine_fit import FittedTest, explanations, fitted_tests, unknown_notes
 from taichi_msm.fitting.machine_model import MachineForces, MachineProblem, read_machine_problem
+from taichi_msm.fitting.machine_units import unit_notes
 from taichi_msm.fitting.observation import ErrorCorrelation
 from taichi_msm.fitting.parameters import Parameter, Request
 from taichi_msm.fitting.predict import Prediction
 from taichi_msm.fitting.profiles import Profiler
 from taichi_msm.fitting.uncertainty import uncertainty
 from taichi_msm.machines.loading import Loading, build_loading, find_approach
-from taichi_msm.machines.reader import MachineTest
+from taichi_msm.machines.reader import TORE, MachineTest
 from taichi_msm.scene.scene import Scene
 from taichi_msm.system.runtime import Device
 from tests.conftest import Program
@@ -243,6 +245,29 @@ def test_uncertainty_of_the_offsets() -> None:
         assert profile.high == pytest.approx(expected[n] + half_width, abs=0.05 * half_width)
 
 
+def test_a_given_offset_is_not_fitted() -> None:
+    """The other test keeps its offset, as in least squares with one more parameter."""
+    misfit, runs = linear_problem()
+    (observed,) = misfit.observations
+    assert isinstance(observed, MachineForces)
+    tests = (replace(observed.tests[0], has_exact_offset=True), observed.tests[1])
+    given = replace(observed, tests=tests)
+    assert given.freedom == observed.freedom + 1
+    rows = np.random.default_rng(5).normal(size=(len(observed.values), 2))
+    count = len(tests[0].force)
+    expected = rows[:count] * (tests[0].information > 0)[:, None]
+    np.testing.assert_array_equal(given.without_offset(rows)[:count], expected)
+    np.testing.assert_array_equal(given.without_offset(rows)[count:], observed.without_offset(rows)[count:])
+    misfit = Misfit([given], [1.0], robust=False)
+    predicted = runs.predict_many([np.array([1.0, 0.0])])[0]
+    solution = Solution(np.array([1.0, 0.0]), predicted, misfit.scales([1.0]), 0.0, converged=True)
+    found = uncertainty(misfit, solution, runs.slopes, ErrorCorrelation(None, None))
+    problem = replace(runs.problem, tests=tests)
+    fitted = fitted_tests(problem, {}, predicted.values[0], runs.slopes, found)
+    assert (fitted[0].loading.offset, fitted[0].offset_error) == (tests[0].offset, 0)
+    assert fitted[1].offset_error > 0
+
+
 def test_offsets_of_a_robust_fit() -> None:
     """Outliers of a tenth of the frames move the offset by less than a standard deviation of a frame."""
     misfit, runs = linear_problem(outliers=24)
@@ -308,6 +333,60 @@ def test_explanations_of_unidentifiable_parameters(message: Messages) -> None:
     message(unknown_notes([fitted], values), "shorter", "longer", "beyond", "stretch")
 
 
+def test_a_tear_is_a_reason_of_an_unknown_lock(message: Messages) -> None:
+    loading = held()
+    test = replace(loading.test, notes=(f"press.csv: {TORE}",))
+    fitted = FittedTest(replace(loading, test=test), loading.contact, loading.force)
+    message(unknown_notes([fitted], {"tissue.stiffening.lock": 4.0}), "tore", "--window")
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "factor", "option"),
+    [
+        ("[N]", "[mN]", 1e3, "force=Force, N"),
+        ("[N]", "[kN]", 1e-5, "force=Force, N"),
+        ("[N]", "[kgf]", 1e-4, "force=Force, gf"),
+        ("[N]", "[kN]", 1e-3, "above 1 MPa"),
+        ("[mm]", "[um]", 1e-6, "depth=Depth, mm"),
+        ("[N]", "[N]", 1e-14, "check"),
+        ("[N]", "[N]", 1.0, ""),
+    ],
+)
+def test_units_that_no_tissue_has(
+    old: str, new: str, factor: float, option: str, pressed: str, tmp_path: Path, message: Messages
+) -> None:
+    """Another unit by a factor of 1000 or 9.81 is named where it helps; forces grow with the square of the depth."""
+    text = Path(pressed).read_text().replace(old, new)
+    (tmp_path / "other.csv").write_text(text)
+    request = Request(scene(), [YOUNG], {}, None, {})
+    problem = read_machine_problem([str(tmp_path / "other.csv")], request)
+    (loading,) = problem.tests
+    travel = loading.travel()
+    predicted = factor * loading.peak * (travel / travel.max()) ** 2
+    notes = list(unit_notes(problem, predicted[:, None]))
+    assert len(notes) == bool(option)
+    if notes:
+        message(notes, option, hide=r"\d[\d.e+-]*(?= Pa,)")
+
+
+def test_notes_about_the_table_come_before_the_search(pressed: str, tmp_path: Path) -> None:
+    (tmp_path / "other.csv").write_text(Path(pressed).read_text().replace("[N]", "[mN]"))
+    events: list[str] = []
+    result = fit(
+        scene(),
+        str(tmp_path / "other.csv"),
+        [YOUNG],
+        contact=[CONTACT],
+        workers=1,
+        report=events.append,
+        progress=lambda stage, done, total: events.append(f"{done}"),
+    )
+    (note,) = (event for event in events if not event.isdecimal())
+    assert note in result.notes
+    assert {*events[: events.index(note)]} <= {"0", "1"}
+    assert int(events[-1]) > 3
+
+
 @pytest.mark.parametrize(
     ("options", "word"),
     [
@@ -315,6 +394,7 @@ def test_explanations_of_unidentifiable_parameters(message: Messages) -> None:
         ({"drift": 1.0}, "drift"),
         ({"rate": -1.0}, "rate"),
         ({"contact": [1e-3, 1e-3]}, "contact"),
+        ({"force_offset": [0.1, 0.1]}, "force-offset"),
         ({"forces": ("forces.csv", 0.1)}, "forces"),
         ({"free": ["contact.1"]}, "contact.1"),
         ({"free": ["probes.0.path.0.3"]}, "path"),
@@ -332,8 +412,9 @@ def test_options_and_files_of_points_and_tables_exclude_each_other(message: Mess
     with message.raises(SceneError, "tracks.npz"):
         fit(scene(), ["tracks.npz", "press.csv"], ["tissue.young"])
     observed = {"time": [0.0], "coordinates": [[0.5, 0.5]], "position": [[[0.0, 0.0, 0.0]]]}
-    with message.raises(SceneError, "rate"):
-        fit(scene(), observed, ["tissue.young"], rate=5.0)
+    for option, value in {"rate": 5.0, "force_offset": [0.1]}.items():
+        with message.raises(SceneError, option.replace("_", "-")):
+            fit(scene(), observed, ["tissue.young"], **{option: value})  # type: ignore[arg-type]
 
 
 def test_command_with_two_tables(pressed: str, tmp_path: Path, program: Program, message: Messages) -> None:

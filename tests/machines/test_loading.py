@@ -147,6 +147,31 @@ def test_contact_is_the_last_row_without_a_force_before_the_peak() -> None:
     assert quiet.contact == pytest.approx(5)
 
 
+@pytest.mark.parametrize("rise_s", [0.05, 0.6, 5.0])
+def test_a_free_contact_starts_at_the_first_row_of_a_test_in_contact(rise_s: float) -> None:
+    """After a step within the rows of the noise, and on a ramp; a test with an approach starts as without."""
+    random, share = np.random.default_rng(0), np.clip(TIME / rise_s, 0, 1)
+    force = np.where(share < 1, share**2, 0.5 + 0.5 * np.exp(rise_s - TIME)) + random.normal(0, 1e-3, len(TIME))
+    for scene_ in (scene(), RELAXING):
+        loading = build_loading(table(TIME, share, force, 1e-5), scene_, fits_contact=True)
+        assert (loading.contact, loading.finds_contact) == (0, False)
+    for test in (table(TIME, TIME, RAMP, 0.01), table(TIME, TIME, RAMP + random.normal(0, 0.2, len(TIME)))):
+        assert build_loading(test, scene(), fits_contact=True).contact == build_loading(test, scene()).contact
+
+
+def test_a_given_offset_is_subtracted() -> None:
+    """From all forces, also the median of the first rows in the first frame."""
+    test = table(TIME, TIME, RAMP + 0.3, 1e-6)
+    for offset in (0.25, 0.3):
+        loading = build_loading(test, scene(), contact=9.0, force_offset=offset)
+        assert (loading.offset, loading.has_exact_offset) == (offset, True)
+        np.testing.assert_allclose(loading.test.force, RAMP + 0.3 - offset, atol=1e-12)
+        rows, near = 2 / np.pi * 51, np.abs(TIME - 8.95) <= 0.525 / DEPTH_FRAMES * (1 + 1e-6)
+        total = loading.test.force[near].sum() + rows * (0.3 - offset)
+        assert loading.force[0] == pytest.approx(total / (near.sum() + rows))
+    assert not build_loading(test, scene()).has_exact_offset
+
+
 def test_note_about_a_late_contact(message: Messages) -> None:
     time, random = np.linspace(0, 5, 101), np.random.default_rng(0)
     early = build_loading(table(time, time, time**2, 1e-3), scene())
@@ -160,12 +185,13 @@ def test_the_tool_waits_until_contact() -> None:
     np.testing.assert_allclose(loading.travel(), np.maximum(loading.depth - 4, 0))
 
 
-@pytest.mark.parametrize("case", ["noise", "depth", "contact"])
+@pytest.mark.parametrize("case", ["noise", "depth", "contact", "offset"])
 def test_tables_without_a_contact_are_refused(case: str, message: Messages) -> None:
     force = 1e-3 * np.sin(TIME) if case == "noise" else RAMP
     test = table(TIME, 20 - TIME if case == "depth" else TIME, force, 0.01)
     with message.raises(SceneError, "press.csv"):
-        build_loading(test, scene(), contact=11.0 if case == "contact" else None)
+        options: dict[str, Any] = {"contact": {"contact": 11.0}, "offset": {"force_offset": 9.0}}.get(case, {})
+        build_loading(test, scene(), **options)
 
 
 def test_travel_in_another_unit(message: Messages) -> None:

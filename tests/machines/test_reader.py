@@ -3,16 +3,22 @@
 from __future__ import annotations
 
 import random
+import re
+import shlex
 from collections.abc import Callable
 from contextlib import suppress
-from datetime import datetime
+from dataclasses import replace
+from datetime import datetime, time
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 
+import taichi_msm.cli.main  # noqa: F401  # registers the commands
+from taichi_msm.cli.options import program
 from taichi_msm.errors import SceneError
+from taichi_msm.fitting.machine_model import is_table
 from taichi_msm.machines.reader import MachineTest, cut_window, read_machine_test
 from tests.golden import Messages
 
@@ -73,9 +79,41 @@ BLUEHILL = (
     '"Time","Extension","Load","Tensile strain (Extension)","Load rate"\n"(s)","(mm)","(N)","(%)","(N/s)"\n'
     + rows(",", '"{t:.5f}"{s}"{d:.5f}"{s}"{f:.5f}"{s}"0.1"{s}"0.0"')
 )
+US_MACHINE = '"Time","Extension","Load"\n"(sec)","(in)","(lbf)"\n' + rows(",", '"{t:.5f}"{s}"{d:.5f}"{s}"{f:.5f}"')
+MTS = "MTS793|MPT|ENU|1|0\n\nStation Name: a.cfg\nAxial Count\tTime\tAxial Displacement\tAxial Force\n"
+MTS += "segments\tSec\tmm\tN\n" + rows("\t", "{t:.3f}{s}{t:.3f}{s}{d:.4f}{s}{f:.4f}")
+WINTEST = '"WinTest","7.1"\nPoints,Elapsed Time ,Disp  ,Load 1  ,\n  ,Sec ,mm ,N ,\n' + rows(",", "1,{t}{s}{d}{s}{f},")
+ANTON_PAAR = f"""Indentation\r
+   Max load :\t1000.00 \tµN\r
+Time :8:00:16 AM\r
+Measured values\r
+Time (s)\tPd (µm)\tFn (µN)\tFnRef (µN)\r
+\r
+{rows(chr(9), "{t:.1f}{s}{d:.1f}{s}{f:.3f}{s}5.35")}"""
+PIUMA = "Date\t15.11.2023\nTime\t10:12:13\n\nTime (s)\tLoad (uN)\tIndentation (nm)\tPiezo (nm)\n"
+PIUMA += comma(rows("\t", "{t:.1f}{s}{f:.3f}{s}{d:.1f}{s}9"))
+JPK = "# xPosition: 0.0\n#\n# units: m N s\n# columns: height vDeflection seriesTime\n"
+JPK_ROWS = rows(" ", "-{d:.1f}e-3 {f:.3f} {t:.1f}")
+JPK_NAMES = '# fancyNames: "Height" "Vertical deflection" "Series time"\n'
+JPK_UNITS_BELOW = "# columns: height vDeflection seriesTime\n# units: m N s\n" + JPK_ROWS
+LVM = """LabVIEW Measurement\t
+X_Columns\tNo
+***End_of_Header***\t
+Samples\t12\t12\t
+Y_Unit_Label\tmm\tN\t
+X_Dimension\tTime\tTime\t
+Delta_X\t0.100000\t0.100000\t
+***End_of_Header***\t\t\t
+X_Value\tDisplacement\tLoad cell force\tComment
+"""
+OWN_NAMES = "".join(f"Step {n}: {n}\n" for n in range(90)) + "Probe 7;Beef;\nt;Eindringtiefe;Last\ns;mm;N\n" + rows()
+OWN = ["time=t", "depth=Eindringtiefe", "force=Last"]
+NUMBERED = ["time=1, s", "depth=2, mm", "force=3, N"]
+SIDE_BY_SIDE = ",Test 1,,,Test 2,,\nForce,Distance,Time,Force,Distance,Time\ng,mm,sec,g,mm,sec\n"
 TEXTURE_ANALYSER = "PROBE TEST1\n\nForce\tDistance\tTime\ng\tmm\tsec\n" + rows("\t", "{f:.3f}{s}{d:.2f}{s}{t:.1f}")
 
 GF = 9.80665e-3
+LBF = 453.59237 * GF
 
 # Exported tables, chosen columns, and the unit of force in newtons.
 EXPORTS: dict[str, tuple[str, list[str], float]] = {
@@ -96,7 +134,22 @@ EXPORTS: dict[str, tuple[str, list[str], float]] = {
     "Instron": (BLUEHILL, [], 1),
     "Mach-1": (MACH_1, [], GF),
     "texture analyser": (TEXTURE_ANALYSER, [], GF),
-    "LabVIEW": (LABVIEW, ["time=X_Value, s"], 1),
+    "LabVIEW": (LABVIEW, [], 1),
+    "LabVIEW, time chosen": (LABVIEW, ["time=X_Value, s"], 1),
+    "LabVIEW without times": (LVM + rows("\t", "{s}{d:.1f}{s}{f:.3f}"), [], 1),
+    "MTS": (MTS, [], 1),
+    "TA Instruments": (WINTEST, [], 1),
+    "Anton Paar": (ANTON_PAAR, ["depth=Pd, mm", "force=Fn, N"], 1),
+    "JPK": (JPK + JPK_NAMES + JPK_ROWS, [], 1),
+    "JPK, raw names": (JPK_UNITS_BELOW, [], 1),
+    "own names": (OWN_NAMES, OWN, 1),
+    "own names by number": (OWN_NAMES, ["time=1", "depth=2", "force=3"], 1),
+    "no names": (rows(), NUMBERED, 1),
+    "no names, spaces": (rows("   ", "  {t:.7e}{s}{d:.7e}{s}{f:.7e}"), NUMBERED, 1),
+    "no names, decimal commas": (comma(rows(" ")), NUMBERED, 1),
+    "one number": (TABLE.replace("Depth", "z"), ["depth=2, mm"], 1),
+    "a name is no number": (TABLE.replace("Depth", "1"), ["depth=1, mm"], 1),
+    "clock": (TABLE.replace("Time [s]", "Time").replace("\n0.", "\n23:01:00.").replace("\n1.", "\n23:01:01."), [], 1),
 }
 
 
@@ -127,8 +180,99 @@ def assert_is_test(test: MachineTest, newtons: float = 1) -> None:
 def test_exports_of_machines(name: str, read: Read) -> None:
     text, columns, newtons = EXPORTS[name]
     test = read(text, *columns)
+    # In a file of nm and uN the choice of mm and N has priority, with a note.
+    assert len(test.notes) == (2 if name == "Anton Paar" else 0)
+    if name == "clock":
+        np.testing.assert_allclose(test.time, 82860 + TIME, rtol=1e-15)
+        test = replace(test, time=np.round(test.time - 82860, 9))
     assert_is_test(test, newtons)
-    assert test.notes == ()
+
+
+def test_units_of_other_machines(read: Read) -> None:
+    """Those of their files, also above the names."""
+    for text, depth, force in (
+        (US_MACHINE, 25.4, LBF),
+        (ANTON_PAAR, 1e-3, 1e-6),
+        (PIUMA, 1e-6, 1e-6),
+        (JPK + JPK_NAMES + JPK_ROWS, 1, 1),
+        (JPK_UNITS_BELOW, 1, 1),
+    ):
+        test = read(text)
+        assert test.notes == ()
+        np.testing.assert_allclose(test.time, TIME, rtol=1e-14)
+        np.testing.assert_allclose(test.depth, depth * DEPTH, rtol=1e-14)
+        np.testing.assert_allclose(test.force, force * FORCE, rtol=1e-14)
+
+
+def test_documented_commands(tmp_path: Path, save: Callable[..., Path]) -> None:
+    """Every machine and program of the page has a command that reads its table."""
+    side_by_side = SIDE_BY_SIDE + rows(",", "{f:.3f}{s}{d:.2f}{s}{t:.1f}{s}{f:.3f}{s}{d:.2f}{s}{t:.1f}")
+    unnamed = LVM.replace("Y_Unit_Label\tmm\tN\t\n", "").replace(
+        "Displacement\tLoad cell force", "Untitled\tUntitled 1"
+    )
+    texts = {
+        "mach1.txt": MACH_1,
+        "bluehill.csv": US_MACHINE,
+        "mts.txt": MTS,
+        "wintest.csv": WINTEST,
+        "texture.csv": side_by_side,
+        "unht.TXT": ANTON_PAAR,
+        "piuma.txt": PIUMA,
+        "jpk.txt": JPK + JPK_NAMES + JPK_ROWS,
+        "labview.lvm": LVM + rows("\t", "{t:.1f}{s}{d:.1f}{s}{f:.3f}"),
+        "untitled.lvm": unnamed + rows("\t", "{t:.1f}{s}{d:.1f}{s}{f:.3f}"),
+        "own.csv": OWN_NAMES,
+        "numbers.dat": rows("   ", "  {t:.7e}{s}{d:.7e}{s}{f:.7e}"),
+    }
+    for name, text in texts.items():
+        (tmp_path / name).write_bytes(text.encode("cp1252" if name == "unht.TXT" else "utf-8"))
+    save({"FF1": SHEET, "FF2A": SHEET}).rename(tmp_path / "zwick.xlsx")
+    page = Path(__file__).parents[2] / "docs/machine-tables.md"
+    commands = re.findall(r"\| `taichi-msm (fit ball\.yaml .*?)` \|", page.read_text())
+    names = set()
+    for command in commands:
+        name, *arguments = shlex.split(command)
+        given = program.commands[name].make_context(name, arguments).params
+        names.add(given["observed"])
+        assert is_table(given["observed"])
+        path = tmp_path / given["observed"]
+        test = read_machine_test(path, given["columns"], given["sheet"], given["block"])
+        np.testing.assert_allclose(test.time, TIME, rtol=1e-14)
+    assert names == {"zwick.xlsx", *texts}
+
+
+@pytest.mark.parametrize("short", ["first", "second", "neither"])
+def test_tests_side_by_side(short: str, read: Read, message: Messages) -> None:
+    """Their rows end where those of the other test may go on; they may share the first column as time."""
+    lines = rows(",", "{f:.3f}{s}{d:.2f}{s}{t:.1f}", 20).splitlines()
+    ends = {"first": (COUNT, 20), "second": (20, COUNT), "neither": (COUNT, COUNT)}[short]
+    pairs = [",".join(line if n < end else ",," for end in ends) for n, line in enumerate(lines[: max(ends)])]
+    text = SIDE_BY_SIDE + "\n".join(pairs)
+    with message.raises(SceneError, "--block", "columns 4 to 6"):
+        read(text)
+    for block, end in enumerate(ends, 1):
+        test = read(text, block=block)
+        assert len(test.time) == end
+        if end == COUNT:
+            assert_is_test(test, GF)
+    # A number of a column chooses a test, too.
+    assert len(read(text, "time=6", "depth=5", "force=4, gf").time) == ends[1]
+    shared = "Time (s),Disp 1 (mm),Force 1 (N),Disp 2 (mm),Force 2 (N)\n" + rows(",", "{t}{s}7{d}{s}8{f}{s}{d}{s}{f}")
+    assert_is_test(read(shared, block=2))
+
+
+@pytest.mark.parametrize("name", ["own names", "no names", "no names, spaces", "clock", "no unit", "repeated"])
+def test_columns_of_the_error_work_when_copied(name: str, read: Read) -> None:
+    text = {
+        "no unit": "Time;Depth;Force\n" + rows(),
+        "repeated": "Time [s];Time [s];Depth [mm];Force [N]\n" + rows(";", "{t}{s}{t}{s}{d}{s}{f}"),
+        "clock": rows(";", "00:00:0{t:.3f}{s}{d}{s}{f}"),
+        **{key: text for key, (text, _, _) in EXPORTS.items() if "names" in key},
+    }[name]
+    with pytest.raises(SceneError) as caught:
+        read(text)
+    assert len(caught.value.lines) == 1
+    assert_is_test(read(text, *re.findall('--columns "([^"]*)"', str(caught.value))))
 
 
 @pytest.mark.parametrize("encoding", ["utf-8", "utf-8-sig", "utf-16", "utf-16-le", "utf-16-be", "cp1252"])
@@ -141,8 +285,10 @@ def test_encodings(encoding: str, tmp_path: Path) -> None:
 
 UNITS = {
     "time": {"s": 1, "ms": 1e-3, "min": 60, "sec": 1},
-    "depth": {"m": 1, "cm": 1e-2, "mm": 1e-3, "um": 1e-6, "µm": 1e-6, "\N{GREEK SMALL LETTER MU}m": 1e-6},
-    "force": {"N": 1, "mN": 1e-3, "kN": 1e3, "gf": GF, "kgf": 1e3 * GF, "KN": 1e3},
+    "depth": {"m": 1, "cm": 1e-2, "mm": 1e-3, "um": 1e-6, "µm": 1e-6, "\N{GREEK SMALL LETTER MU}m": 1e-6, "nm": 1e-9}
+    | {"in": 0.0254, "inch": 0.0254},
+    "force": {"N": 1, "mN": 1e-3, "kN": 1e3, "gf": GF, "kgf": 1e3 * GF, "KN": 1e3}
+    | {"uN": 1e-6, "µN": 1e-6, "lbf": LBF, "ozf": LBF / 16},
 }
 
 
@@ -218,9 +364,9 @@ def test_contradictory_units(read: Read, message: Messages) -> None:
     for values, numbers in ((test.time, 1e-3 * TIME), (test.depth, 1e3 * DEPTH), (test.force, 1e3 * FORCE)):
         np.testing.assert_allclose(values, numbers, rtol=1e-14)
     message(test.notes, "'ms'", "'m'", "'kN'")
-    test = read("Time (s);Depth (mm);Force (N)\ns;mm;lbf\n" + rows())
+    test = read("Time (s);Depth (mm);Force (N)\ns;mm;dyn\n" + rows())
     assert_is_test(test)
-    message(test.notes, "Force (N)", "'lbf'")
+    message(test.notes, "Force (N)", "'dyn'")
     assert read("Time (s);Depth (mm);Force (N)\n[s];mm;(N)\n" + rows()).notes == ()
 
 
@@ -299,8 +445,8 @@ FAULTS: dict[str, tuple[str | bytes, list[str], list[str]]] = {
     "no names": (rows(), [], ["--columns"]),
     "no depth": (TABLE.replace("Depth", "Traverse"), [], ["csv:1", "depth", "Traverse"]),
     "names in one cell": ("time/depth/force\n" + rows(), [], ["csv:1"]),
-    "no unit": (TABLE.replace(" [mm]", ""), [], ["csv:1", "Depth", '--columns "depth=Depth, UNIT"']),
-    "other unit": (TABLE.replace("[N]", "[lbf]"), [], ["Force [lbf]", "kgf"]),
+    "no unit": (TABLE.replace(" [mm]", ""), [], ["csv:1", "Depth", '--columns "depth=Depth, mm"']),
+    "other unit": (TABLE.replace("[N]", "[dyn]"), [], ["Force [dyn]", "kgf"]),
     "megaunit": (TABLE.replace("[N]", "[MN]"), [], ["Force [MN]"]),
     "repeated name": (HEADER + ";Force [N]\n" + rows(";", "{t}{s}{d}{s}{f}{s}{f}"), [], ["csv:1", "Force [N]", "2"]),
     "gap": (TABLE.replace("0.5;0.50;0.250", "0.5;;0.250"), [], ["csv:7", "Depth [mm]", "empty"]),
@@ -404,6 +550,13 @@ def test_workbook(save: Save, message: Messages) -> None:
     shifted.insert(8, [None] * 6 + ["a note"])
     path = save({"FF2": shifted}, put("XFD1048576", 1))
     assert_is_test(read_machine_test(path.rename(path.with_suffix(".XLSX"))))
+
+
+def test_clock_times_of_a_workbook(save: Save) -> None:
+    cells = [[time(9, 0, n // 10, n % 10 * 100_000), *row[1:]] for n, row in enumerate(SHEET[3:])]
+    test = read_machine_test(save({"FF2": [*SHEET[:3], *cells]}))
+    # Excel keeps times as shares of a day, with 15 digits; clock times have microseconds.
+    np.testing.assert_allclose(test.time, 32400 + TIME, atol=1e-6)
 
 
 def test_chosen_sheet_and_block(save: Save, message: Messages) -> None:
