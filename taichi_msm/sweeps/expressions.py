@@ -19,7 +19,23 @@ MAX_LENGTH = 200
 
 Function = Callable[..., float]
 
-FUNCTIONS: dict[str, Function] = {"min": min, "max": max, "sqrt": math.sqrt, "sin": math.sin, "cos": math.cos}
+
+def _floor(number: float) -> float:
+    # NaN stands for a value that is not known yet.
+    return number if math.isnan(number) else math.floor(number)
+
+
+FUNCTIONS: dict[str, Function] = {
+    "min": min,
+    "max": max,
+    "abs": abs,
+    "floor": _floor,
+    "sqrt": math.sqrt,
+    "exp": math.exp,
+    "log": math.log,
+    "sin": math.sin,
+    "cos": math.cos,
+}
 CONSTANTS = {"pi": math.pi}
 SYNTAX = f"numbers, + - * / ** ( ), {', '.join(FUNCTIONS)}, pi, and names of variables"
 

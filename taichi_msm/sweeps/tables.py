@@ -153,7 +153,7 @@ def write_dataset(state: SweepState, written: list[str]) -> list[str]:
     settings = sweep.settings
     expressions = (key for key, value in settings.set.items() if replace_expressions(value, lambda *_: None) != value)
     # These sections of the scene determine the format of a run.
-    differ = any(key.split(".")[0] in ("output", "render", "time") for key in (*settings.vary, *expressions))
+    differ = any(key.split(".")[0] in ("output", "render", "time") for key in (*settings.distributions, *expressions))
     splits = assign_splits(len(state.outcomes), settings.seed)
     head = {"scene": settings.scene, **sweep.description(), "versions": versions(), "commit": commit(), **common}
     with replacing(state.directory / "dataset.json") as file:

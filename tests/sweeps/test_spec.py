@@ -98,6 +98,29 @@ def test_grids_give_every_combination() -> None:
     assert sweep_of(None, a=ten).values(100) == [[n] for n in range(10)]
 
 
+def test_keys_of_a_group_vary_row_by_row(folder: Path) -> None:
+    """A group is one dimension of the grids, and its rows are the values at one index of its lists."""
+    young, thickness, damping = [1e4, 2e4], [1e-3, 2e-3], {"grid": [0.01, 0.02]}
+    together = [{"a.young": young, "a.thickness": thickness}, {"image": ["textures/b.png", "textures/a.png", 3]}]
+    rows = SweepSettings(scene="any.yaml", vary={"damping": damping}, together=together)
+    expected = [
+        [number, *row, image]
+        for number in damping["grid"]
+        for row in zip(young, thickness, strict=True)
+        for image in together[1]["image"]
+    ]
+    sweep = Sweep(None, rows)  # type: ignore[arg-type]
+    assert sweep.values() == expected
+    assert sweep.keys == ["damping", "a.young", "a.thickness", "image"]
+    assert sweep.overrides(expected[0])[1:3] == ("a.young=10000.0", "a.thickness=0.001")
+    text = "scene: small.yaml\ntogether: [{image: [textures/a.png, speckle.png], damping: [0.02, 0.01]}]\n"
+    Path("rows.yaml").write_text(text)
+    loaded = load_sweep("rows.yaml")
+    assert loaded.values() == [["textures/a.png", 0.02], ["speckle.png", 0.01]]
+    assert {Path(name).name for name in loaded.files} == {"a.png", "speckle.png"}
+    assert loaded.description()["together"] == loaded.settings.together
+
+
 CELLS: list[Any] = [
     *(0.1, 1e-7, 1 / 3, 5, -2.5e300, True, None, [0.1, [2, "x"]], {"a": [1]}),
     *("none", "a b, c", "1e3", "true", "#a", "ü", ""),
@@ -223,6 +246,8 @@ EXPRESSIONS = {
     "=min(x, cos(pi)) / (1 + 1)": -0.5,
     "= sin(+x) / sqrt(4)": math.sin(0.5) / 2,
     "=" + "-" * 198 + "1": 1,
+    "=exp(log(abs(-x)))": 0.5,
+    "=floor(-x) + floor(7)": 6,
 }
 
 
@@ -283,6 +308,15 @@ FAULTS: dict[str, tuple[dict[str, Any], str]] = {
     "not allowed": (expression("=__import__('os').getpid()"), "set.probes.0.force.1"),
     "no expression": (expression("=2 x"), "set.probes.0.force.1"),
     "a long expression": (expression("=" + "-" * 200), "set.probes.0.force.1"),
+    "lengths": (
+        {"samples": None, "vary": None, "together": [{"damping": [0.1, 0.2], "springs.shear": [1, 2, 3]}]},
+        "together.0.springs.shear",
+    ),
+    "no keys together": ({"together": [{}]}, "together.0"),
+    "not a group": ({"together": [[1]]}, "together.0"),
+    "samples of a group": ({"together": [{"springs.shear": [1]}]}, "samples"),
+    "unknown key together": ({"samples": None, "vary": None, "together": [{"dampign": [1]}]}, "together.0.dampign"),
+    "twice": ({"samples": None, **vary({"grid": [1]}), "together": [{"damping": [1]}]}, "together"),
     "no calibration": ({"set": {"render.camera.calibration": "a.yml"}}, "set.render.camera.calibration"),
     "combinations": (
         {"samples": None, "vary": {key: {"grid": list(range(4000))} for key in ("damping", "springs.shear")}},
