@@ -66,8 +66,8 @@ class SweepSettings(Section):
     )
     together: list[dict[str, NonEmptyList]] = key(
         [],
-        "groups of keys of the scene by their dotted paths, each with a list of values; the keys of a group vary row by "
-        "row, and each group is a grid",
+        "groups of keys of the scene by their dotted paths, each with a list of values; the keys of a group vary row "
+        "by row, and each group is a grid",
         "a list of mappings from keys to lists, such as [{tissue.young: [1e4, 2e4], tissue.thickness: [1e-3, 2e-3]}]",
     )
     set: dict[str, Any] = key(
