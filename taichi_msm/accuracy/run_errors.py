@@ -12,7 +12,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from taichi_msm.accuracy.buckling import buckling_warnings
-from taichi_msm.accuracy.companions import NEGLIGIBLE_ERROR, QUASISTATIC_REASON, CompanionRuns
+from taichi_msm.accuracy.companions import (
+    MESH_DOUBT,
+    MESH_REMEDY,
+    NEGLIGIBLE_ERROR,
+    QUASISTATIC_REASON,
+    CompanionRuns,
+)
 from taichi_msm.accuracy.contact_warnings import tool_contact_warnings
 from taichi_msm.accuracy.divergence import energy_growth_warnings
 from taichi_msm.accuracy.mask import mask_notes
@@ -65,10 +71,6 @@ MIN_SPRING_RATIO = 0.5
 
 # Smallest error for which a remedy is suggested, relative to the largest displacement.
 REMEDY_THRESHOLD = 0.01
-
-# Beginnings of the warnings of the mesh, which sweeps report once.
-MESH_DOUBT = "the mesh error may be larger"
-MESH_REMEDY = "for a smaller error of the mesh"
 
 
 class ForceEstimate(NamedTuple):

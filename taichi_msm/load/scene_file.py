@@ -101,7 +101,7 @@ def plan_file(file: ParsedFile, overrides: Overrides = (), image: str | Path | N
     ):
         raise ArgumentError(f'overrides: {overrides!r}; take ["sheet.points=[61,61]"] or {{"sheet.points": [61, 61]}}')
     draft = Draft(file)
-    if "scene" in draft.data and {"vary", "variables"} & draft.data.keys():
+    if "scene" in draft.data and {"vary", "variables", "together"} & draft.data.keys():
         raise SceneError([f"{file.name}:1:1: a sweep; use `taichi-msm sweep`"])
     parsed = (
         starmap(_to_override, overrides.items()) if isinstance(overrides, Mapping) else map(parse_override, overrides)

@@ -7,7 +7,7 @@ import json
 import keyword
 import math
 import os
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import suppress
 from copy import deepcopy
 from dataclasses import dataclass
@@ -77,13 +77,13 @@ class SweepSettings(Section):
         "a mapping",
     )
 
-    @property
+    @cached_property
     def distributions(self) -> dict[str, Distribution]:
         """Distributions of variables, varied keys and grouped keys, in the order of dimensions and columns."""
         grouped = {name: Distribution(grid=values) for group in self.together for name, values in group.items()}
         return {**self.variables, **self.vary, **grouped}
 
-    @property
+    @cached_property
     def grids(self) -> list[list[tuple[Any, ...]]]:
         """Rows of the values of each grid: of one variable or key, or of the keys of a group."""
         single = ({name: item.values} for name, item in (self.variables | self.vary).items())
@@ -103,7 +103,9 @@ class SweepSettings(Section):
             if name in {"run", *RESULT_COLUMNS, "seconds"}:
                 raise scene_fault("is the name of a column of table.csv; take another", name)
             is_identifier = name.isascii() and name.isidentifier() and not keyword.iskeyword(name)
-            if name in {*FUNCTIONS, *CONSTANTS} or not is_identifier:
+            if name in {*FUNCTIONS, *CONSTANTS}:
+                raise scene_fault("has another meaning in expressions; take another name", name)
+            if not is_identifier:
                 raise scene_fault("is not a valid name; take letters, digits and _, such as x1", name)
             for value in distribution.values:
                 if isinstance(value, list) or not numbers(value):
@@ -131,8 +133,10 @@ class SweepSettings(Section):
         varied = self.distributions
         if not varied:
             raise scene_fault("no keys; name at least one, such as tissue.young: {uniform: [1e4, 3e4]}", "vary")
-        grouped = [name for group in self.together for name in group]
-        if both := self.variables.keys() & {*self.vary, *grouped}:
+        places: list[Key] = [("set", name) for name in self.set]
+        places += [("vary", name) for name in self.vary]
+        places += [("together", index, name) for index, group in enumerate(self.together) for name in group]
+        if both := self.variables.keys() & {str(place[-1]) for place in places[len(self.set) :]}:
             fault = "is also a varied key, with its column in table.csv; take another name"
             raise scene_fault(fault, "variables", min(both))
         grids = [name for name, distribution in varied.items() if distribution.kind == "grid"]
@@ -148,14 +152,13 @@ class SweepSettings(Section):
             raise scene_fault(fault, "vary")
         if (count := sum(distribution.dimensions for distribution in varied.values())) > MAX_DIMENSIONS:
             raise scene_fault(f"{count} numbers, more than the {MAX_DIMENSIONS} that can vary; take fewer", "vary")
-        keys = [_split_key(name) for name in (*self.set, *self.vary, *grouped)]
+        keys = [_split_key(str(place[-1])) for place in places]
         for number, later in enumerate(keys):
             if replaced := [earlier for earlier in keys[:number] if earlier[: len(later)] == later]:
                 name, earlier_name = (".".join(map(str, key)) for key in (later, replaced[0]))
                 remedy = "keep one" if later == replaced[0] else f"keep one, or give {name} first"
-                sections = ["set"] * len(self.set) + ["vary"] * len(self.vary) + ["together"] * len(grouped)
-                section = sections[number]
-                raise scene_fault(f"{name} replaces {earlier_name}, which comes before it; {remedy}", section)
+                fault = f"{name} replaces {earlier_name}, which comes before it; {remedy}"
+                raise scene_fault(fault, *places[number][:-1])
         return self
 
 
@@ -217,10 +220,7 @@ class Sweep:
         return values[::-1]
 
     def overrides(self, values: list[Any]) -> tuple[str, ...]:
-        """Return the arguments of `run --set` for the values of a run.
-
-        A key whose expression has no value gets the message of the error as its value, so that the run is refused.
-        """
+        """Return the arguments of `run --set` for the values of a run; a SceneError if an expression has no value."""
         settings, count = self.settings, len(self.settings.variables)
         variables = dict(zip(settings.variables, values[:count], strict=True))
         fixed = dict(settings.set)
@@ -228,7 +228,7 @@ class Sweep:
             try:
                 fixed[name] = replace_expressions(value, lambda _, text: evaluate(text, variables))
             except ExpressionError as error:
-                fixed[name] = str(error)
+                raise SceneError([f"set.{name}: {error}"]) from None
         pairs = [*fixed.items(), *zip(self.keys[count:], values[count:], strict=True)]
         return tuple(f"{name}={format_override(value)}" for name, value in pairs)
 
@@ -309,18 +309,17 @@ def _check(data: dict[str, Any], folder: Path) -> tuple[Sweep | None, list[Probl
     sections = (data.get(name) for name in ("variables", "vary", "set"))
     variables, vary, fixed = (section if isinstance(section, dict) else {} for section in sections)
     groups = data.get("together")
-    # Keys of distributions, by their places in the file.
-    varied: dict[Key, Any] = {("vary", name): value for name, value in vary.items()}
-    for index, group in enumerate(groups if isinstance(groups, list) else ()):
-        items = group.items() if isinstance(group, dict) else ()
-        varied |= {("together", index, name): value for name, value in items}
+    together = [group if isinstance(group, dict) else {} for group in (groups if isinstance(groups, list) else ())]
     file, name = None, data.get("scene")
     if isinstance(name, str) and name:
         path = folder / name
-        problems += _relocate(varied, fixed, folder, path.parent)
+        problems += _relocate(_value_lists(vary, together), fixed, folder, path.parent)
         try:
             # A name without folder, as errors of runs must not depend on the current directory.
             file = scene_file.read_file(_normalise(path), *scene_file.SCENE)._replace(name=path.name)
+            varied: dict[Key, Any] = {("vary", name): value for name, value in vary.items()}
+            for index, group in enumerate(together):
+                varied |= {("together", index, name): {"grid": values} for name, values in group.items()}
             problems += _unknown_keys(file, varied, fixed)
         except SceneError as error:
             problems.append(Problem(("scene",), error.lines[0]))
@@ -363,23 +362,35 @@ def format_override(value: Any) -> str:
     return json.dumps(value, ensure_ascii=False)
 
 
-def _relocate(varied: dict[Key, Any], fixed: dict[str, Any], folder: Path, scene_folder: Path) -> Iterator[Problem]:
+# Place of a list of values in the sweep file, the key of the scene, and the dict that contains the list.
+ValueList = tuple[Key, Key, dict[str, Any]]
+
+
+def _value_lists(vary: dict[str, Any], together: list[dict[str, Any]]) -> Iterator[ValueList]:
+    """Yield the choices, grids and columns of groups, each a list or a file pattern."""
+    for name, distribution in vary.items():
+        for kind in ("choice", "grid"):
+            if isinstance(distribution, dict) and kind in distribution:
+                yield ("vary", name, kind), _split_key(name), distribution
+    for index, group in enumerate(together):
+        for name in group:
+            yield ("together", index, name), _split_key(name), group
+
+
+def _relocate(lists: Iterable[ValueList], fixed: dict[str, Any], folder: Path, scene_folder: Path) -> Iterator[Problem]:
     """Expand file patterns, and make paths relative to the scene's folder; in place. Yield the errors."""
     # Place of each value, key of the scene, and the list or dict that contains the value.
     places: list[tuple[Key, Key, Any]] = []
-    for place, distribution in varied.items():
-        key = _split_key(str(place[-1]))
-        if isinstance(distribution, list):
-            places += [((*place, index), key, distribution) for index in range(len(distribution))]
-        for kind in [each for each in ("choice", "grid") if isinstance(distribution, dict) and each in distribution]:
-            if isinstance(pattern := distribution[kind], str) and scene_file.names_file(key):
-                distribution[kind] = _matching_files(pattern, folder, key)
-                if not distribution[kind]:
-                    noun = _file_noun(key)
-                    message = f"{format_value(pattern)} matches no {noun}; give a pattern relative to the sweep file"
-                    yield Problem((*place, kind), message)
-            if isinstance(values := distribution[kind], list):
-                places += [((*place, kind, index), key, values) for index in range(len(values))]
+    for place, scene_key, container in lists:
+        name = str(place[-1])
+        if isinstance(pattern := container[name], str) and scene_file.names_file(scene_key):
+            container[name] = _matching_files(pattern, folder, scene_key)
+            if not container[name]:
+                noun = _file_noun(scene_key)
+                message = f"{format_value(pattern)} matches no {noun}; give a pattern relative to the sweep file"
+                yield Problem(place, message)
+        if isinstance(values := container[name], list):
+            places += [((*place, index), scene_key, values) for index in range(len(values))]
     places += [(("set", name), _split_key(name), fixed) for name in fixed]
     problems = []
 
@@ -394,8 +405,8 @@ def _relocate(varied: dict[Key, Any], fixed: dict[str, Any], folder: Path, scene
         # Links are resolved first, as .. after a symbolic link is the parent of its target.
         return Path(os.path.relpath(path.parent.resolve() / path.name, scene_folder.resolve())).as_posix()
 
-    for place, key, container in places:
-        container[place[-1]] = _map_files(key, container[place[-1]], partial(relocate, place))
+    for place, scene_key, container in places:
+        container[place[-1]] = _map_files(scene_key, container[place[-1]], partial(relocate, place))
     yield from problems
 
 
@@ -433,7 +444,7 @@ def _unknown_keys(scene: scene_file.ParsedFile, varied: dict[Key, Any], fixed: d
     """Yield an error for each key that a scene cannot have, by trying one value of each key."""
     trials: dict[Key, Any] = {("set", name): value for name, value in fixed.items()}
     for path, distribution in varied.items():
-        values = next(iter(distribution.values()), None) if isinstance(distribution, dict) else distribution
+        values = next(iter(distribution.values()), None) if isinstance(distribution, dict) else None
         trials[path] = values[0] if isinstance(values, list) and values else None
     draft = scene_file.Draft(scene)
     keys = {}

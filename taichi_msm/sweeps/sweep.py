@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import Executor
 from contextlib import AbstractContextManager, nullcontext
 from pathlib import Path
@@ -37,7 +37,6 @@ def sweep(
     directory: str | Path,
     *,
     variables: Mapping[str, Mapping[str, Any]] | None = None,
-    together: Sequence[Mapping[str, Sequence[Any]]] = (),
     samples: int | None = None,
     seed: int = 1,
     overrides: Mapping[str, Any] | None = None,
@@ -56,7 +55,6 @@ def sweep(
             within it.
         directory: directory for runs/, table.csv and the other reports.
         variables: distributions of the numbers in expressions of `overrides`, by name, as in a sweep file.
-        together: groups of keys that vary row by row, as in a sweep file, each key with the list of its values.
         samples: number of runs; None for all combinations of the grids.
         seed: seed of the samples.
         overrides: values of keys in all runs, by dotted key; texts that begin with = are expressions of the variables.
@@ -90,7 +88,7 @@ def sweep(
     if executor is not None and not isinstance(executor, str) and not hasattr(executor, "submit"):
         raise ArgumentError(f"executor: {executor!r}; take None, an address or an executor with submit")
     require_type(progress, Callable, "progress", "a function")
-    settings = {"variables": variables or {}, "vary": vary, "together": together, "seed": seed, "set": overrides or {}}
+    settings = {"variables": variables or {}, "vary": vary, "seed": seed, "set": overrides or {}}
     settings |= {} if samples is None else {"samples": samples}
     spec = make_sweep(scene, settings)
     # Absolute, as the caller may change the current directory before iterating.

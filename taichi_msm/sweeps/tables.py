@@ -18,7 +18,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from taichi_msm.accuracy.run_errors import MESH_DOUBT, MESH_REMEDY
+from taichi_msm.accuracy.companions import MESH_DOUBT, MESH_REMEDY
 from taichi_msm.errors import SceneError, StageProgressCallback
 from taichi_msm.load import cost
 from taichi_msm.load.scene_file import plan_file
@@ -240,18 +240,13 @@ def summary_lines(
             statistics = f"median {median(error for error, _ in errors):.2g}, largest {largest:.2g} (run {run:06})"
             lines.append(f"error, as a fraction of the largest displacement, due to {cause}: {statistics}")
     # All runs have nearly the same warnings of the mesh: those of the run with the largest error stand for all.
-    _, mesh_notes = max(
-        (
-            (outcome.mesh_error or 0, notes)
-            for outcome in outcomes
-            if (notes := list(filter(_is_of_mesh, outcome.notes)))
-        ),
-        default=(0, []),
-    )
-    lines += mesh_notes
-    if mesh_notes:
+    of_mesh = [outcome for outcome in outcomes if any(map(_is_of_mesh, outcome.notes))]
+    if of_mesh:
+        worst = max(of_mesh, key=lambda outcome: outcome.mesh_error or 0)
+        warnings = "; ".join(filter(_is_of_mesh, worst.notes))
+        lines.append(f"{_runs(len(of_mesh))} with a warning of the mesh, for example run {worst.run:06}: {warnings}")
         lines.append(
-            "labels follow the simulated surface and agree with the pictures; this error is one of the physics"
+            "labels follow the simulated surface, so they agree with the pictures; the error is of the physics"
         )
     # Warnings that differ only in numbers are a group; the five largest groups have an example each.
     groups: dict[str, list[str]] = {}

@@ -20,7 +20,7 @@ from taichi_msm.load.scene_file import load_plan, names_file, parse_override, pl
 from taichi_msm.scene.scene import Scene
 from taichi_msm.scene.section import MAX_PATH
 from taichi_msm.sweeps.distribution import CONTINUOUS, Continuous, Distribution
-from taichi_msm.sweeps.expressions import evaluate
+from taichi_msm.sweeps.expressions import ExpressionError, evaluate
 from taichi_msm.sweeps.spec import Sweep, SweepSettings, format_override, load_sweep, make_sweep
 from tests.golden import Messages
 from tests.scenes import speckle
@@ -231,13 +231,27 @@ def test_variables_and_their_columns(folder: Path) -> None:
     assert "variables" not in make_sweep("small.yaml", {"samples": 4, "vary": varied}).description()
 
 
+def test_patterns_of_files_in_a_group(folder: Path) -> None:
+    group = {"image": "textures/*.png", "damping": [0.02, 0.01]}
+    swept = make_sweep("small.yaml", {"together": [group]})
+    assert swept.values() == [["textures/a.png", 0.02], ["textures/b.png", 0.01]]
+
+
+@pytest.mark.parametrize(
+    "text", ["=log(x - 1)", "=1 / (x - x)", "=exp(800 * x)", "=floor(x, 2)", "=x**-0.5 + sqrt(-x)"]
+)
+def test_expressions_without_a_value(text: str, message: Messages) -> None:
+    with message.raises(ExpressionError, text):
+        evaluate(text, {"x": 1.0})
+
+
 def test_expression_without_a_value_refuses_its_run(folder: Path, message: Messages) -> None:
     settings = {"variables": {"x": {"grid": [0, 1]}}, "set": {"probes.0.at": [0.5, "=sqrt(x - 1)"]}}
     swept = make_sweep("small.yaml", settings)
-    refused, valid = (swept.overrides(row) for row in swept.values())
+    refused, valid = swept.values()
     with message.raises(SceneError, "probes.0.at", "sqrt(x - 1)"):
-        plan_file(swept.scene, refused)
-    assert plan_file(swept.scene, valid).scene.probes[0].at == (0.5, 0.0)
+        swept.overrides(refused)
+    assert plan_file(swept.scene, swept.overrides(valid)).scene.probes[0].at == (0.5, 0.0)
 
 
 EXPRESSIONS = {
@@ -316,7 +330,24 @@ FAULTS: dict[str, tuple[dict[str, Any], str]] = {
     "not a group": ({"together": [[1]]}, "together.0"),
     "samples of a group": ({"together": [{"springs.shear": [1]}]}, "samples"),
     "unknown key together": ({"samples": None, "vary": None, "together": [{"dampign": [1]}]}, "together.0.dampign"),
-    "twice": ({"samples": None, **vary({"grid": [1]}), "together": [{"damping": [1]}]}, "together"),
+    "twice in groups": (
+        {"samples": None, "vary": None, "together": [{"damping": [1]}, {"springs.shear": [1], "damping": [2]}]},
+        "together.1",
+    ),
+    "a grouped key": (
+        {"samples": None, "vary": None, "variables": {"damping": {"grid": [1]}}, "together": [{"damping": [1]}]},
+        "variables.damping",
+    ),
+    "no values together": ({"together": [{"damping": 3}]}, "together.0.damping"),
+    "not finite together": (
+        {"samples": None, "vary": None, "together": [{"damping": [math.nan]}]},
+        "together.0.damping",
+    ),
+    "no picture together": (
+        {"samples": None, "vary": None, "together": [{"image": ["textures/c.png"]}]},
+        "together.0.image.0",
+    ),
+    "twice": ({"samples": None, **vary({"grid": [1]}), "together": [{"damping": [1]}]}, "together.0"),
     "no calibration": ({"set": {"render.camera.calibration": "a.yml"}}, "set.render.camera.calibration"),
     "combinations": (
         {"samples": None, "vary": {key: {"grid": list(range(4000))} for key in ("damping", "springs.shear")}},

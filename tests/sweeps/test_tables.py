@@ -21,7 +21,7 @@ from PIL import Image
 from scipy.stats import qmc
 
 from taichi_msm import sweep
-from taichi_msm.accuracy.run_errors import MESH_DOUBT, MESH_REMEDY
+from taichi_msm.accuracy.companions import MESH_DOUBT, MESH_REMEDY
 from taichi_msm.errors import ForeignError
 from taichi_msm.load.scene_file import parse_override
 from taichi_msm.plot_style import STYLE
