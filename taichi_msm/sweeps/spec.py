@@ -20,7 +20,7 @@ from pydantic import Field, field_validator, model_validator
 from typing_extensions import Self
 
 from taichi_msm.array_files import ARRAY_SUFFIXES
-from taichi_msm.errors import ArgumentError, Key, Problem, SceneError, truncate
+from taichi_msm.errors import ArgumentError, Key, Problem, SceneError, truncate, windows_path_hint
 from taichi_msm.images import PICTURE_SUFFIXES, PictureError, file_sha256
 from taichi_msm.load import scene_file
 from taichi_msm.load.check import parse_model
@@ -401,6 +401,7 @@ def _relocate(lists: Iterable[ValueList], fixed: dict[str, Any], folder: Path, s
             problems.append(Problem(place, message))
         elif not os.path.isfile(path):  # noqa: PTH113  # Path.is_file raises an error for a long name
             message = f"{truncate(text)}: no such file; name a {noun} relative to the sweep file"
+            message += windows_path_hint(text)
             problems.append(Problem(place, message))
         # Links are resolved first, as .. after a symbolic link is the parent of its target.
         return Path(os.path.relpath(path.parent.resolve() / path.name, scene_folder.resolve())).as_posix()

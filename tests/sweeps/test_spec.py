@@ -101,7 +101,10 @@ def test_grids_give_every_combination() -> None:
 def test_keys_of_a_group_vary_row_by_row(folder: Path) -> None:
     """A group is one dimension of the grids, and its rows are the values at one index of its lists."""
     young, thickness, damping = [1e4, 2e4], [1e-3, 2e-3], {"grid": [0.01, 0.02]}
-    together = [{"a.young": young, "a.thickness": thickness}, {"image": ["textures/b.png", "textures/a.png", 3]}]
+    together: list[dict[str, Any]] = [
+        {"a.young": young, "a.thickness": thickness},
+        {"image": ["textures/b.png", "textures/a.png", 3]},
+    ]
     rows = SweepSettings(scene="any.yaml", vary={"damping": damping}, together=together)
     expected = [
         [number, *row, image]
@@ -231,6 +234,19 @@ def test_variables_and_their_columns(folder: Path) -> None:
     assert "variables" not in make_sweep("small.yaml", {"samples": 4, "vary": varied}).description()
 
 
+@pytest.mark.parametrize("key", ["scene", "image", "render.camera.calibration", "sheet.surface"])
+def test_paths_of_windows(key: str, folder: Path, message: Messages) -> None:
+    path: Any = {"height": {"file": "textures\\a.npy", "unit": "m"}} if key == "sheet.surface" else "textures\\a.png"
+    with message.raises(SceneError, "write /"):
+        if key == "scene":
+            load_plan(path)
+        else:
+            load_plan("small.yaml", [f"{key}={json.dumps(path)}"])
+    if key != "scene":
+        with message.raises(SceneError, key, "write /"):
+            make_sweep("small.yaml", {"vary": {key: {"grid": [path]}}})
+
+
 def test_patterns_of_files_in_a_group(folder: Path) -> None:
     group = {"image": "textures/*.png", "damping": [0.02, 0.01]}
     swept = make_sweep("small.yaml", {"together": [group]})
@@ -314,6 +330,7 @@ FAULTS: dict[str, tuple[dict[str, Any], str]] = {
     "section replaced": ({"set": {"springs.shear": 3}, **vary({"choice": [{"shear": 1}]}, "springs")}, "vary"),
     "a variable of texts": ({"variables": {"x": {"choice": ["a"]}}}, "variables.x.choice"),
     "a column": ({"variables": {"seconds": {"uniform": [0, 1]}}}, "variables.seconds"),
+    "not a name": ({"variables": {"x y": {"uniform": [0, 1]}}}, "variables.x y"),
     "a varied key": ({"variables": {"damping": {"uniform": [0, 1]}}}, "variables.damping"),
     "a function": ({"variables": {"max": {"uniform": [0, 1]}}}, "variables.max"),
     "unknown variable": (expression("=radius + 1", radios={"uniform": [0, 1]}), "set.probes.0.force.1"),
