@@ -143,7 +143,7 @@ class SweepSettings(Section):
         if self.samples is not None and grids:
             fault = f"{grids[0]} is a grid, which gives every combination; take choice, or leave out samples"
             if grids[0] not in self.variables | self.vary:
-                fault = "together gives grids, of which every combination is run; leave out samples or together"
+                fault = "together is a grid, which gives every combination; leave out samples, and take grids in vary"
             raise scene_fault(fault, "samples")
         if self.samples is None and len(grids) < len(varied):
             raise scene_fault("missing; expected the number of runs, as not every key is a grid", "samples")

@@ -285,6 +285,7 @@ EXPRESSIONS = {
 def test_expressions(text: str) -> None:
     value = evaluate(text, {"x": 0.5})
     assert (value, type(value)) == (EXPRESSIONS[text], type(EXPRESSIONS[text]))
+    evaluate(text, {"x": math.nan})  # the check of a file, before the values are known
 
 
 GOOD = {"scene": "small.yaml", "samples": 2, "vary": {"damping": {"uniform": [0.01, 0.02]}}}
