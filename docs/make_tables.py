@@ -64,7 +64,9 @@ def model_keys(model: type[Section], *titles: str) -> str:
     lines = []
     for name, field in model.model_fields.items():
         assert isinstance(field.json_schema_extra, dict)
-        default = "**required**" if field.is_required() else "" if field.default in (None, {}) else f"`{field.default}`"
+        default = (
+            "**required**" if field.is_required() else "" if field.default in (None, {}, []) else f"`{field.default}`"
+        )
         cells = [f"`{name}`", field.description, field.json_schema_extra["expects"], default][: len(titles)]
         lines.append(f"| {' | '.join(map(str, cells))} |")
     return f"| {' | '.join(titles)} |\n|{'---|' * len(titles)}\n" + "\n".join(lines) + "\n"

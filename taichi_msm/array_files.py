@@ -9,6 +9,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
+from taichi_msm.errors import windows_path_hint
 from taichi_msm.images import PictureError, actual_path, require_memory
 from taichi_msm.system.files import read_regular
 
@@ -64,7 +65,8 @@ def read_raw_array(
         data = read_regular(actual_path(path), MAX_BYTES)
     except (OSError, ValueError) as error:
         reason = getattr(error, "strerror", None) or str(error)
-        raise PictureError(f"{path}: {reason.lower()}", "name an .npy or .npz file that can be read") from None
+        remedy = f"name an .npy or .npz file that can be read{windows_path_hint(path)}"
+        raise PictureError(f"{path}: {reason.lower()}", remedy) from None
     remedy = f"with numpy.save, save an array of numbers of shape {shapes}"
     try:
         array = _load(path, data, names)

@@ -81,7 +81,7 @@ class _Split:
                 remedy = f"run the sweep with set: {{output: [{', '.join(self.outputs)}]}}"
                 raise ArgumentError(f"directory: {folder / camera} has no {', '.join(missing)}; {remedy}")
             if not folder.is_dir():
-                raise FilesError(f"{folder}: no such folder; {REPEAT}")
+                raise FilesError(f"{folder}: no such folder; run the sweep again")
         if not self.runs:
             longest = max(run["frames"] for run in runs)
             fault = f"frames: {length}; the longest run of {split!r} has {longest}"

@@ -6,6 +6,7 @@ Only the command line prints errors, or turns them into exit codes.
 from __future__ import annotations
 
 import errno
+import os
 import re
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
@@ -135,6 +136,11 @@ def did_you_mean(name: str, known: Iterable[str]) -> str:
     # Matching takes time in proportion to the length of the name; a single letter is similar to none.
     matches = get_close_matches(name[:60].lower(), [each for each in known if len(each) > 1], n=1)
     return f"; did you mean '{matches[0]}'?" if matches and matches[0] != name else ""
+
+
+def windows_path_hint(path: str) -> str:
+    r"""Return a hint for a missing path such as textures\a.png on a system with /; empty for other paths."""
+    return "; write / in place of \\" if "\\" in path and os.sep == "/" else ""
 
 
 @contextmanager

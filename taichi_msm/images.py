@@ -11,6 +11,7 @@ from mmap import ACCESS_READ, mmap
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, BinaryIO
 
+from taichi_msm.errors import windows_path_hint
 from taichi_msm.system.process import available_memory, discarded_output
 
 if TYPE_CHECKING:
@@ -247,7 +248,8 @@ def _require_file(path: str) -> None:
 def _unreadable(path: str, error: OSError) -> PictureError:
     if isinstance(error, PermissionError):
         return PictureError(f"{path} may not be read", "change its permissions")
-    return PictureError(f"{path}: {(error.strerror or str(error)).lower()}", "name a picture that can be read")
+    remedy = f"name a picture that can be read{windows_path_hint(path)}"
+    return PictureError(f"{path}: {(error.strerror or str(error)).lower()}", remedy)
 
 
 def _to_8_bit(image: Image.Image) -> Image.Image:

@@ -13,6 +13,9 @@ from typing import NamedTuple
 from taichi_msm.model.plan import Plan
 from taichi_msm.solver.planning import affords_companions, min_stable_steps
 
+# Beginnings of a run's warnings of the mesh, which sweeps report once.
+MESH_DOUBT, MESH_REMEDY = "the mesh error may be larger", "for a smaller error of the mesh"
+
 # A smaller error, as a fraction of the largest displacement, needs no fine companion run.
 NEGLIGIBLE_ERROR = 1e-3
 

@@ -12,7 +12,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from taichi_msm.accuracy.buckling import buckling_warnings
-from taichi_msm.accuracy.companions import NEGLIGIBLE_ERROR, QUASISTATIC_REASON, CompanionRuns
+from taichi_msm.accuracy.companions import (
+    MESH_DOUBT,
+    MESH_REMEDY,
+    NEGLIGIBLE_ERROR,
+    QUASISTATIC_REASON,
+    CompanionRuns,
+)
 from taichi_msm.accuracy.contact_warnings import tool_contact_warnings
 from taichi_msm.accuracy.divergence import energy_growth_warnings
 from taichi_msm.accuracy.mask import mask_notes
@@ -257,11 +263,11 @@ def run_warnings(
     yield from buckling_warnings(plan, progress)
     yield from energy_growth_warnings(plan, progress)
     if mesh is not None and mesh.doubt and mesh.error < math.inf:
-        yield f"the mesh error may be larger: {mesh.doubt}"
+        yield f"{MESH_DOUBT}: {mesh.doubt}"
     # The warning about a mesh that is too coarse for a tool already contains the remedy.
     too_coarse_for_tool = any(COARSE_TIP_PHRASE in warning for warning in tool_warnings)
     if mesh is not None and REMEDY_THRESHOLD < mesh.error < math.inf and not too_coarse_for_tool:
-        yield f"for a smaller error of the mesh, {_mesh_remedy(plan, mesh, affords)}"
+        yield f"{MESH_REMEDY}, {_mesh_remedy(plan, mesh, affords)}"
     if progress.max_displacement == 0 and progress.frame > 0:
         yield "nothing moved: check at, load or path of the probes"
     foundation = scene.tissue.foundation if scene.tissue is not None else None

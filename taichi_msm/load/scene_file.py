@@ -12,7 +12,7 @@ from itertools import chain, starmap
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from taichi_msm.errors import ArgumentError, Key, Problem, SceneError, require_type, truncate
+from taichi_msm.errors import ArgumentError, Key, Problem, SceneError, require_type, truncate, windows_path_hint
 from taichi_msm.images import PICTURE_SUFFIXES, actual_path, file_sha256, irregular_kind
 from taichi_msm.load.check import validate, value_at
 from taichi_msm.load.yaml_reader import MAX_DEPTH, Document, Mark, UnreadableError, mark_at, read_yaml
@@ -101,7 +101,7 @@ def plan_file(file: ParsedFile, overrides: Overrides = (), image: str | Path | N
     ):
         raise ArgumentError(f'overrides: {overrides!r}; take ["sheet.points=[61,61]"] or {{"sheet.points": [61, 61]}}')
     draft = Draft(file)
-    if "scene" in draft.data and {"vary", "variables"} & draft.data.keys():
+    if "scene" in draft.data and {"vary", "variables", "together"} & draft.data.keys():
         raise SceneError([f"{file.name}:1:1: a sweep; use `taichi-msm sweep`"])
     parsed = (
         starmap(_to_override, overrides.items()) if isinstance(overrides, Mapping) else map(parse_override, overrides)
@@ -239,6 +239,7 @@ class Draft:
             except OSError as error:
                 kind = "trajectory" if key[-1] == "poses" else "calibration"
                 message = f"{folder / path}: {(error.strerror or str(error)).lower()}; name a {kind} that can be read"
+                message += windows_path_hint(path)
                 self.problems.append((self._origin(key), Problem(key, message)))
             except ValueError:
                 pass  # Validation refuses the path.
@@ -332,7 +333,9 @@ def _read_text(name: str, kind: str) -> str:
         raise SceneError([f"{name}: not a path; name a {kind} file"]) from None
     except OSError as error:
         scenes = path.parent.glob("*.y*ml") if isinstance(error, FileNotFoundError) else ()
-        hint = next((f"; did you mean '{scene}'?" for scene in scenes if scene.stem == path.stem), "")
+        hint = next(
+            (f"; did you mean '{scene}'?" for scene in scenes if scene.stem == path.stem), windows_path_hint(name)
+        )
         raise SceneError([f"{name}: {(error.strerror or str(error)).lower()}{hint}"]) from None
     if len(raw) > MAX_BYTES:
         raise SceneError([f"{name}: larger than {MAX_BYTES // 2**20} MiB; a {kind} is smaller"])

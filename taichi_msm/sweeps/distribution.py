@@ -7,13 +7,23 @@ import math
 from collections.abc import Callable, Sequence
 from typing import Annotated, Any, NamedTuple
 
-from pydantic import ConfigDict, Field, ValidationInfo, create_model, field_validator, model_validator
+from pydantic import AfterValidator, ConfigDict, Field, ValidationInfo, create_model, field_validator, model_validator
 from typing_extensions import Self
 
 from taichi_msm.scene.section import MAX_MAGNITUDE, Section, format_value, key, scene_fault
 
 LIST = "a list of values that is not empty"
-NonEmptyList = Annotated[list[Any], Field(min_length=1)]
+
+
+def _require_finite(values: list[Any]) -> list[Any]:
+    try:
+        json.dumps(values, allow_nan=False)
+    except ValueError:
+        raise scene_fault(f"{format_value(values)} has an infinite number or NaN; take finite ones") from None
+    return values
+
+
+NonEmptyList = Annotated[list[Any], Field(min_length=1), AfterValidator(_require_finite)]
 
 
 class Continuous(NamedTuple):
@@ -98,15 +108,6 @@ class Distribution(_Continuous):  # type: ignore[misc]
         for parameters in zip(*map(numbers, value), strict=True):
             if fault := row.fault(*parameters):
                 raise scene_fault(fault)
-        return value
-
-    @field_validator("choice", "grid")
-    @classmethod
-    def _is_finite(cls, value: Any) -> Any:
-        try:
-            json.dumps(value, allow_nan=False)
-        except ValueError:
-            raise scene_fault(f"{format_value(value)} has an infinite number or NaN; take finite ones") from None
         return value
 
     @model_validator(mode="after")

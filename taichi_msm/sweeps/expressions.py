@@ -19,7 +19,23 @@ MAX_LENGTH = 200
 
 Function = Callable[..., float]
 
-FUNCTIONS: dict[str, Function] = {"min": min, "max": max, "sqrt": math.sqrt, "sin": math.sin, "cos": math.cos}
+
+def _floor(number: float) -> float:
+    # NaN stands for a value that is not known yet.
+    return number if math.isnan(number) else math.floor(number)
+
+
+FUNCTIONS: dict[str, Function] = {
+    "min": min,
+    "max": max,
+    "abs": abs,
+    "floor": _floor,
+    "sqrt": math.sqrt,
+    "exp": math.exp,
+    "log": math.log,
+    "sin": math.sin,
+    "cos": math.cos,
+}
 CONSTANTS = {"pi": math.pi}
 SYNTAX = f"numbers, + - * / ** ( ), {', '.join(FUNCTIONS)}, pi, and names of variables"
 
@@ -46,7 +62,7 @@ class ExpressionError(ValueError):
 
 
 def evaluate(text: str, variables: Mapping[str, float]) -> float:
-    """Evaluate an expression that begins with =; an int if it has only ints and no division.
+    """Evaluate an expression that begins with =; an int if it is a floor, or has only ints and no division.
 
     Raise an ExpressionError when it is invalid, or its value is not defined or too large; NaN as the value of variables
     raises only errors that do not depend on values.
@@ -82,15 +98,18 @@ def _value(node: ast.expr, names: Mapping[str, float]) -> float:
             values, function = [_value(argument, names) for argument in arguments], FUNCTIONS[name]
         case _:
             raise ExpressionError(f"{ast.unparse(node)} is not allowed; take {SYNTAX}")
+    fault = "is too large"
     try:
         result = function(*values)
         if not math.isinf(result):
             return result
     except TypeError:
         raise ExpressionError(f"{ast.unparse(node)} has the wrong number of arguments") from None
-    except (ArithmeticError, ValueError):
+    except OverflowError:
         pass
-    raise ExpressionError(f"{ast.unparse(node)} is not defined or too large")
+    except (ZeroDivisionError, ValueError):
+        fault = "is not defined"
+    raise ExpressionError(f"{ast.unparse(node)}, of {' and '.join(f'{value:g}' for value in values)}, {fault}")
 
 
 def replace_expressions(value: Any, change: Callable[[Key, str], Any], path: Key = ()) -> Any:

@@ -267,9 +267,9 @@ def read_gif_frame(path: Path, time: float) -> Image.Image:
 
 def _column_count(state: SweepState, tiles: int) -> int:
     """Choose the number of columns: of a grid, the number of values of its last key; otherwise about that of rows."""
-    last = list(state.sweep.settings.distributions.values())[-1]
-    if tiles == len(state.outcomes) and last.kind == "grid" and 1 < len(last.values) <= 8:
-        return len(last.values)
+    settings = state.sweep.settings
+    if tiles == len(state.outcomes) and settings.samples is None and 1 < len(settings.grids[-1]) <= 8:
+        return len(settings.grids[-1])
     square = math.ceil(math.sqrt(tiles))
     return min(square, square + 1, key=lambda columns: -tiles % columns)
 

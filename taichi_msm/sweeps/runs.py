@@ -127,7 +127,11 @@ def begin_sweep(sweep: Sweep, directory: Path, shard: tuple[int, int] = (1, 1)) 
     home = Path.cwd()
     for run in range(part - 1, len(state.values), parts):
         folder = require_kind(state.run_directory(run), FOLDER)
-        task = RunTask(run, sweep.scene, sweep.overrides(state.values[run]), folder, home)
+        task = RunTask(run, sweep.scene, (), folder, home)
+        try:
+            task = task._replace(overrides=sweep.overrides(state.values[run]))
+        except SceneError as error:
+            task = task._replace(fault=str(error))
         if outcome := read_outcome(task, sweep):
             state.outcomes.append(outcome)
         else:
@@ -232,6 +236,7 @@ class RunTask(NamedTuple):
     overrides: tuple[str, ...]
     directory: Path  # of the results
     home: Path  # current directory of the run, the base of relative paths
+    fault: str = ""  # of an expression without a value, for which the run is refused
 
 
 def execute_run(task: RunTask, progress: StageProgressCallback = lambda stage, done, total: None) -> Outcome:
@@ -256,6 +261,8 @@ def execute_run(task: RunTask, progress: StageProgressCallback = lambda stage, d
 
 
 def _run_scene(task: RunTask, progress: StageProgressCallback) -> Mapping[str, Any]:
+    if task.fault:
+        raise SceneError([task.fault])
     plan = plan_file(task.scene, task.overrides)
     try:
         cost.require_disk(plan, task.directory)

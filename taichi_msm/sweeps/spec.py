@@ -7,7 +7,7 @@ import json
 import keyword
 import math
 import os
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import suppress
 from copy import deepcopy
 from dataclasses import dataclass
@@ -20,14 +20,14 @@ from pydantic import Field, field_validator, model_validator
 from typing_extensions import Self
 
 from taichi_msm.array_files import ARRAY_SUFFIXES
-from taichi_msm.errors import ArgumentError, Key, Problem, SceneError, truncate
+from taichi_msm.errors import ArgumentError, Key, Problem, SceneError, truncate, windows_path_hint
 from taichi_msm.images import PICTURE_SUFFIXES, PictureError, file_sha256
 from taichi_msm.load import scene_file
 from taichi_msm.load.check import parse_model
 from taichi_msm.load.yaml_reader import UnreadableError, read_yaml
 from taichi_msm.scene.scene import Scene
 from taichi_msm.scene.section import MAX_PATH, FilePath, Integer, Section, format_value, key, scene_fault
-from taichi_msm.sweeps.distribution import Distribution, numbers
+from taichi_msm.sweeps.distribution import Distribution, NonEmptyList, numbers
 from taichi_msm.sweeps.expressions import CONSTANTS, FUNCTIONS, ExpressionError, evaluate, replace_expressions
 
 # Columns of table.csv between the varied keys and the forces of probes.
@@ -61,8 +61,14 @@ class SweepSettings(Section):
     )
     vary: dict[str, Distribution] = key(
         {},
-        "keys of the scene by their dotted paths, and how each varies; required without variables",
+        "keys of the scene by their dotted paths, and how each varies; required without variables and together",
         "a mapping, such as tissue.young: {uniform: [1e4, 3e4]}",
+    )
+    together: list[dict[str, NonEmptyList]] = key(
+        [],
+        "groups of keys of the scene by their dotted paths, each with a list of values; the keys of a group vary row "
+        "by row, and each group is a grid",
+        "a list of mappings from keys to lists, such as [{tissue.young: [1e4, 2e4], tissue.thickness: [1e-3, 2e-3]}]",
     )
     set: dict[str, Any] = key(
         {},
@@ -71,17 +77,24 @@ class SweepSettings(Section):
         "a mapping",
     )
 
-    @property
+    @cached_property
     def distributions(self) -> dict[str, Distribution]:
-        """Distributions of the variables, then of the varied keys, in the order of dimensions and columns."""
-        return {**self.variables, **self.vary}
+        """Distributions of variables, varied keys and grouped keys, in the order of dimensions and columns."""
+        grouped = {name: Distribution(grid=values) for group in self.together for name, values in group.items()}
+        return {**self.variables, **self.vary, **grouped}
+
+    @cached_property
+    def grids(self) -> list[list[tuple[Any, ...]]]:
+        """Rows of the values of each grid: of one variable or key, or of the keys of a group."""
+        single = ({name: item.values} for name, item in (self.variables | self.vary).items())
+        return [list(zip(*group.values(), strict=True)) for group in (*single, *self.together)]
 
     @property
     def runs(self) -> int:
         """Number of runs."""
         if self.samples is not None:
             return self.samples
-        return math.prod(len(distribution.values) for distribution in self.distributions.values())
+        return math.prod(map(len, self.grids))
 
     @field_validator("variables")
     @classmethod
@@ -90,7 +103,9 @@ class SweepSettings(Section):
             if name in {"run", *RESULT_COLUMNS, "seconds"}:
                 raise scene_fault("is the name of a column of table.csv; take another", name)
             is_identifier = name.isascii() and name.isidentifier() and not keyword.iskeyword(name)
-            if name in {*FUNCTIONS, *CONSTANTS} or not is_identifier:
+            if name in {*FUNCTIONS, *CONSTANTS}:
+                raise scene_fault("has another meaning in expressions; take another name", name)
+            if not is_identifier:
                 raise scene_fault("is not a valid name; take letters, digits and _, such as x1", name)
             for value in distribution.values:
                 if isinstance(value, list) or not numbers(value):
@@ -98,17 +113,37 @@ class SweepSettings(Section):
                     raise scene_fault(fault, name, distribution.kind)
         return variables
 
+    @field_validator("together")
+    @classmethod
+    def _check_groups(cls, together: list[dict[str, list[Any]]]) -> list[dict[str, list[Any]]]:
+        for index, group in enumerate(together):
+            if not group:
+                raise scene_fault("no keys; name at least two, each with a list of values", index)
+            first, *others = group
+            for name in others:
+                if len(group[name]) != len(group[first]):
+                    counts = f"{len(group[name])} values, and {first} has {len(group[first])}"
+                    raise scene_fault(
+                        f"{counts}; the lists of a group vary row by row, so give one length", index, name
+                    )
+        return together
+
     @model_validator(mode="after")
     def _is_consistent(self) -> Self:
         varied = self.distributions
         if not varied:
             raise scene_fault("no keys; name at least one, such as tissue.young: {uniform: [1e4, 3e4]}", "vary")
-        if both := self.variables.keys() & self.vary.keys():
-            fault = "is also a key of vary, with its column in table.csv; take another name"
+        places: list[Key] = [("set", name) for name in self.set]
+        places += [("vary", name) for name in self.vary]
+        places += [("together", index, name) for index, group in enumerate(self.together) for name in group]
+        if both := self.variables.keys() & {str(place[-1]) for place in places[len(self.set) :]}:
+            fault = "is also a varied key, with its column in table.csv; take another name"
             raise scene_fault(fault, "variables", min(both))
         grids = [name for name, distribution in varied.items() if distribution.kind == "grid"]
         if self.samples is not None and grids:
             fault = f"{grids[0]} is a grid, which gives every combination; take choice, or leave out samples"
+            if grids[0] not in self.variables | self.vary:
+                fault = "together is a grid, which gives every combination; leave out samples, and take grids in vary"
             raise scene_fault(fault, "samples")
         if self.samples is None and len(grids) < len(varied):
             raise scene_fault("missing; expected the number of runs, as not every key is a grid", "samples")
@@ -117,13 +152,13 @@ class SweepSettings(Section):
             raise scene_fault(fault, "vary")
         if (count := sum(distribution.dimensions for distribution in varied.values())) > MAX_DIMENSIONS:
             raise scene_fault(f"{count} numbers, more than the {MAX_DIMENSIONS} that can vary; take fewer", "vary")
-        keys = [_split_key(name) for name in (*self.set, *self.vary)]
+        keys = [_split_key(str(place[-1])) for place in places]
         for number, later in enumerate(keys):
             if replaced := [earlier for earlier in keys[:number] if earlier[: len(later)] == later]:
                 name, earlier_name = (".".join(map(str, key)) for key in (later, replaced[0]))
                 remedy = "keep one" if later == replaced[0] else f"keep one, or give {name} first"
-                section = "vary" if number >= len(self.set) else "set"
-                raise scene_fault(f"{name} replaces {earlier_name}, which comes before it; {remedy}", section)
+                fault = f"{name} replaces {earlier_name}, which comes before it; {remedy}"
+                raise scene_fault(fault, *places[number][:-1])
         return self
 
 
@@ -178,17 +213,14 @@ class Sweep:
         return [list(values) for values in zip(*columns, strict=True)]
 
     def _combination(self, run: int) -> list[Any]:
-        values = []
-        for distribution in reversed(self.settings.distributions.values()):
-            run, index = divmod(run, len(distribution.values))
-            values.append(distribution.values[index])
+        values: list[Any] = []
+        for rows in reversed(self.settings.grids):
+            run, index = divmod(run, len(rows))
+            values += reversed(rows[index])
         return values[::-1]
 
     def overrides(self, values: list[Any]) -> tuple[str, ...]:
-        """Return the arguments of `run --set` for the values of a run.
-
-        A key whose expression has no value gets the message of the error as its value, so that the run is refused.
-        """
+        """Return the arguments of `run --set` for the values of a run; a SceneError if an expression has no value."""
         settings, count = self.settings, len(self.settings.variables)
         variables = dict(zip(settings.variables, values[:count], strict=True))
         fixed = dict(settings.set)
@@ -196,8 +228,8 @@ class Sweep:
             try:
                 fixed[name] = replace_expressions(value, lambda _, text: evaluate(text, variables))
             except ExpressionError as error:
-                fixed[name] = str(error)
-        pairs = [*fixed.items(), *zip(settings.vary, values[count:], strict=True)]
+                raise SceneError([f"set.{name}: {error}"]) from None
+        pairs = [*fixed.items(), *zip(self.keys[count:], values[count:], strict=True)]
         return tuple(f"{name}={format_override(value)}" for name, value in pairs)
 
     @cached_property
@@ -212,7 +244,7 @@ class Sweep:
         _map_files((), self.scene.document.data, collect)
         for name, value in self.settings.set.items():
             _map_files(_split_key(name), value, collect)
-        for name, distribution in self.settings.vary.items():
+        for name, distribution in self.settings.distributions.items():
             for value in distribution.values:
                 _map_files(_split_key(name), value, collect)
         digests = {}
@@ -237,6 +269,7 @@ class Sweep:
             **settings.model_dump(include={"samples", "seed", "set"}),
             **({"variables": variables} if variables else {}),  # Absent in records of earlier versions.
             "vary": vary,
+            **({"together": settings.together} if settings.together else {}),
             "digest": hashlib.sha256(json.dumps(self.scene.document.data).encode()).hexdigest(),
             "files": {os.path.relpath(path, self.scene.folder): digest for path, digest in self.files.items()},
         }
@@ -245,7 +278,7 @@ class Sweep:
 def load_sweep(path: str | Path) -> Sweep:
     """Read and check a sweep file; raise a SceneError with a line for each error, in the order of the file."""
     draft = scene_file.Draft(scene_file.read_file(str(path), "sweep", "scene and vary"))
-    if "sheet" in draft.data and not {"vary", "variables"} & draft.data.keys():
+    if "sheet" in draft.data and not {"vary", "variables", "together"} & draft.data.keys():
         raise SceneError([f"{path}:1:1: a scene; use `taichi-msm run`, or name it by `scene:` in a sweep file"])
     sweep, problems = _check(draft.data, Path(path).parent)
     draft.report(problems)
@@ -275,14 +308,19 @@ def _check(data: dict[str, Any], folder: Path) -> tuple[Sweep | None, list[Probl
     problems: list[Problem] = []
     sections = (data.get(name) for name in ("variables", "vary", "set"))
     variables, vary, fixed = (section if isinstance(section, dict) else {} for section in sections)
+    groups = data.get("together")
+    together = [group if isinstance(group, dict) else {} for group in (groups if isinstance(groups, list) else ())]
     file, name = None, data.get("scene")
     if isinstance(name, str) and name:
         path = folder / name
-        problems += _relocate(vary, fixed, folder, path.parent)
+        problems += _relocate(_value_lists(vary, together), fixed, folder, path.parent)
         try:
             # A name without folder, as errors of runs must not depend on the current directory.
             file = scene_file.read_file(_normalise(path), *scene_file.SCENE)._replace(name=path.name)
-            problems += _unknown_keys(file, vary, fixed)
+            varied: dict[Key, Any] = {("vary", name): value for name, value in vary.items()}
+            for index, group in enumerate(together):
+                varied |= {("together", index, name): {"grid": values} for name, values in group.items()}
+            problems += _unknown_keys(file, varied, fixed)
         except SceneError as error:
             problems.append(Problem(("scene",), error.lines[0]))
     problems += _expression_problems(variables, fixed)
@@ -324,21 +362,36 @@ def format_override(value: Any) -> str:
     return json.dumps(value, ensure_ascii=False)
 
 
-def _relocate(vary: dict[str, Any], fixed: dict[str, Any], folder: Path, scene_folder: Path) -> Iterator[Problem]:
-    """Expand file patterns, and make paths relative to the scene's folder; in place. Yield the errors."""
-    places: list[tuple[Key, Any]] = []  # key of each value, and the list or dict that contains it
+# Place of a list of values in the sweep file, the key of the scene, and the dict that contains the list.
+ValueList = tuple[Key, Key, dict[str, Any]]
+
+
+def _value_lists(vary: dict[str, Any], together: list[dict[str, Any]]) -> Iterator[ValueList]:
+    """Yield the choices, grids and columns of groups, each a list or a file pattern."""
     for name, distribution in vary.items():
-        for kind in [each for each in ("choice", "grid") if isinstance(distribution, dict) and each in distribution]:
-            key = _split_key(name)
-            if isinstance(pattern := distribution[kind], str) and scene_file.names_file(key):
-                distribution[kind] = _matching_files(pattern, folder, key)
-                if not distribution[kind]:
-                    noun = _file_noun(key)
-                    message = f"{format_value(pattern)} matches no {noun}; give a pattern relative to the sweep file"
-                    yield Problem(("vary", name, kind), message)
-            if isinstance(values := distribution[kind], list):
-                places += [(("vary", name, kind, index), values) for index in range(len(values))]
-    places += [(("set", name), fixed) for name in fixed]
+        for kind in ("choice", "grid"):
+            if isinstance(distribution, dict) and kind in distribution:
+                yield ("vary", name, kind), _split_key(name), distribution
+    for index, group in enumerate(together):
+        for name in group:
+            yield ("together", index, name), _split_key(name), group
+
+
+def _relocate(lists: Iterable[ValueList], fixed: dict[str, Any], folder: Path, scene_folder: Path) -> Iterator[Problem]:
+    """Expand file patterns, and make paths relative to the scene's folder; in place. Yield the errors."""
+    # Place of each value, key of the scene, and the list or dict that contains the value.
+    places: list[tuple[Key, Key, Any]] = []
+    for place, scene_key, container in lists:
+        name = str(place[-1])
+        if isinstance(pattern := container[name], str) and scene_file.names_file(scene_key):
+            container[name] = _matching_files(pattern, folder, scene_key)
+            if not container[name]:
+                noun = _file_noun(scene_key)
+                message = f"{format_value(pattern)} matches no {noun}; give a pattern relative to the sweep file"
+                yield Problem(place, message)
+        if isinstance(values := container[name], list):
+            places += [((*place, index), scene_key, values) for index in range(len(values))]
+    places += [(("set", name), _split_key(name), fixed) for name in fixed]
     problems = []
 
     def relocate(place: Key, key: Key, text: str) -> str:
@@ -348,12 +401,13 @@ def _relocate(vary: dict[str, Any], fixed: dict[str, Any], folder: Path, scene_f
             problems.append(Problem(place, message))
         elif not os.path.isfile(path):  # noqa: PTH113  # Path.is_file raises an error for a long name
             message = f"{truncate(text)}: no such file; name a {noun} relative to the sweep file"
+            message += windows_path_hint(text)
             problems.append(Problem(place, message))
         # Links are resolved first, as .. after a symbolic link is the parent of its target.
         return Path(os.path.relpath(path.parent.resolve() / path.name, scene_folder.resolve())).as_posix()
 
-    for place, container in places:
-        container[place[-1]] = _map_files(_split_key(str(place[1])), container[place[-1]], partial(relocate, place))
+    for place, scene_key, container in places:
+        container[place[-1]] = _map_files(scene_key, container[place[-1]], partial(relocate, place))
     yield from problems
 
 
@@ -387,16 +441,16 @@ def _split_key(name: str) -> Key:
     return scene_file.parse_key(name.strip()) if "=" not in name else ()
 
 
-def _unknown_keys(scene: scene_file.ParsedFile, vary: dict[str, Any], fixed: dict[str, Any]) -> Iterator[Problem]:
+def _unknown_keys(scene: scene_file.ParsedFile, varied: dict[Key, Any], fixed: dict[str, Any]) -> Iterator[Problem]:
     """Yield an error for each key that a scene cannot have, by trying one value of each key."""
     trials: dict[Key, Any] = {("set", name): value for name, value in fixed.items()}
-    for name, distribution in vary.items():
+    for path, distribution in varied.items():
         values = next(iter(distribution.values()), None) if isinstance(distribution, dict) else None
-        trials["vary", name] = values[0] if isinstance(values, list) and values else None
+        trials[path] = values[0] if isinstance(values, list) and values else None
     draft = scene_file.Draft(scene)
     keys = {}
     for path, value in trials.items():
-        if not (key := _split_key(str(path[1]))):
+        if not (key := _split_key(str(path[-1]))):
             yield Problem(path, "not a key; expected a dotted path such as sheet.points")
             continue
         keys[path] = key

@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import hashlib
 import io
+import itertools
 import json
 import re
 from collections import Counter
@@ -17,6 +18,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from taichi_msm.accuracy.companions import MESH_DOUBT, MESH_REMEDY
 from taichi_msm.errors import SceneError, StageProgressCallback
 from taichi_msm.load import cost
 from taichi_msm.load.scene_file import plan_file
@@ -153,7 +155,7 @@ def write_dataset(state: SweepState, written: list[str]) -> list[str]:
     settings = sweep.settings
     expressions = (key for key, value in settings.set.items() if replace_expressions(value, lambda *_: None) != value)
     # These sections of the scene determine the format of a run.
-    differ = any(key.split(".")[0] in ("output", "render", "time") for key in (*settings.vary, *expressions))
+    differ = any(key.split(".")[0] in ("output", "render", "time") for key in (*settings.distributions, *expressions))
     splits = assign_splits(len(state.outcomes), settings.seed)
     head = {"scene": settings.scene, **sweep.description(), "versions": versions(), "commit": commit(), **common}
     with replacing(state.directory / "dataset.json") as file:
@@ -237,14 +239,27 @@ def summary_lines(
             largest, run = max(errors)
             statistics = f"median {median(error for error, _ in errors):.2g}, largest {largest:.2g} (run {run:06})"
             lines.append(f"error, as a fraction of the largest displacement, due to {cause}: {statistics}")
+    # All runs have nearly the same warnings of the mesh: those of the run with the largest error stand for all.
+    of_mesh = [outcome for outcome in outcomes if any(map(_is_of_mesh, outcome.notes))]
+    if of_mesh:
+        worst = max(of_mesh, key=lambda outcome: outcome.mesh_error or 0)
+        warnings = "; ".join(filter(_is_of_mesh, worst.notes))
+        lines.append(f"{_runs(len(of_mesh))} with a warning of the mesh, for example run {worst.run:06}: {warnings}")
+        lines.append(
+            "labels follow the simulated surface, so they agree with the pictures; the error is of the physics"
+        )
     # Warnings that differ only in numbers are a group; the five largest groups have an example each.
     groups: dict[str, list[str]] = {}
     for outcome in outcomes:
-        for note in outcome.notes:
+        for note in itertools.filterfalse(_is_of_mesh, outcome.notes):
             groups.setdefault(re.sub(r"[0-9.e+-]+", "", note), []).append(f"run {outcome.run:06}: {note}")
     for group in sorted(groups.values(), key=len, reverse=True)[:5]:
         lines.append(f"{_runs(len(group))} with a warning, for example {group[0]}")
     return [*lines, "without --shard, the same command writes the table" if shard else ", ".join(files), *notes]
+
+
+def _is_of_mesh(note: str) -> bool:
+    return note.startswith((MESH_DOUBT, MESH_REMEDY))
 
 
 def _runs(number: int) -> str:

@@ -20,7 +20,7 @@ from taichi_msm.load.scene_file import load_plan, names_file, parse_override, pl
 from taichi_msm.scene.scene import Scene
 from taichi_msm.scene.section import MAX_PATH
 from taichi_msm.sweeps.distribution import CONTINUOUS, Continuous, Distribution
-from taichi_msm.sweeps.expressions import evaluate
+from taichi_msm.sweeps.expressions import ExpressionError, evaluate
 from taichi_msm.sweeps.spec import Sweep, SweepSettings, format_override, load_sweep, make_sweep
 from tests.golden import Messages
 from tests.scenes import speckle
@@ -96,6 +96,32 @@ def test_grids_give_every_combination() -> None:
     assert grids.values()[1234] == [1, 234]
     assert grids.values(4) == [[1, 250], [3, 750], [6, 250], [8, 750]], "evenly spaced runs"
     assert sweep_of(None, a=ten).values(100) == [[n] for n in range(10)]
+
+
+def test_keys_of_a_group_vary_row_by_row(folder: Path) -> None:
+    """A group is one dimension of the grids, and its rows are the values at one index of its lists."""
+    young, thickness, damping = [1e4, 2e4], [1e-3, 2e-3], {"grid": [0.01, 0.02]}
+    together: list[dict[str, Any]] = [
+        {"a.young": young, "a.thickness": thickness},
+        {"image": ["textures/b.png", "textures/a.png", 3]},
+    ]
+    rows = SweepSettings(scene="any.yaml", vary={"damping": damping}, together=together)
+    expected = [
+        [number, *row, image]
+        for number in damping["grid"]
+        for row in zip(young, thickness, strict=True)
+        for image in together[1]["image"]
+    ]
+    sweep = Sweep(None, rows)  # type: ignore[arg-type]
+    assert sweep.values() == expected
+    assert sweep.keys == ["damping", "a.young", "a.thickness", "image"]
+    assert sweep.overrides(expected[0])[1:3] == ("a.young=10000.0", "a.thickness=0.001")
+    text = "scene: small.yaml\ntogether: [{image: [textures/a.png, speckle.png], damping: [0.02, 0.01]}]\n"
+    Path("rows.yaml").write_text(text)
+    loaded = load_sweep("rows.yaml")
+    assert loaded.values() == [["textures/a.png", 0.02], ["speckle.png", 0.01]]
+    assert {Path(name).name for name in loaded.files} == {"a.png", "speckle.png"}
+    assert loaded.description()["together"] == loaded.settings.together
 
 
 CELLS: list[Any] = [
@@ -208,13 +234,40 @@ def test_variables_and_their_columns(folder: Path) -> None:
     assert "variables" not in make_sweep("small.yaml", {"samples": 4, "vary": varied}).description()
 
 
+@pytest.mark.parametrize("key", ["scene", "image", "render.camera.calibration", "sheet.surface"])
+def test_paths_of_windows(key: str, folder: Path, message: Messages) -> None:
+    path: Any = {"height": {"file": "textures\\a.npy", "unit": "m"}} if key == "sheet.surface" else "textures\\a.png"
+    with message.raises(SceneError, "write /"):
+        if key == "scene":
+            load_plan(path)
+        else:
+            load_plan("small.yaml", [f"{key}={json.dumps(path)}"])
+    if key != "scene":
+        with message.raises(SceneError, key, "write /"):
+            make_sweep("small.yaml", {"vary": {key: {"grid": [path]}}})
+
+
+def test_patterns_of_files_in_a_group(folder: Path) -> None:
+    group = {"image": "textures/*.png", "damping": [0.02, 0.01]}
+    swept = make_sweep("small.yaml", {"together": [group]})
+    assert swept.values() == [["textures/a.png", 0.02], ["textures/b.png", 0.01]]
+
+
+@pytest.mark.parametrize(
+    "text", ["=log(x - 1)", "=1 / (x - x)", "=exp(800 * x)", "=floor(x, 2)", "=x**-0.5 + sqrt(-x)"]
+)
+def test_expressions_without_a_value(text: str, message: Messages) -> None:
+    with message.raises(ExpressionError, text):
+        evaluate(text, {"x": 1.0})
+
+
 def test_expression_without_a_value_refuses_its_run(folder: Path, message: Messages) -> None:
     settings = {"variables": {"x": {"grid": [0, 1]}}, "set": {"probes.0.at": [0.5, "=sqrt(x - 1)"]}}
     swept = make_sweep("small.yaml", settings)
-    refused, valid = (swept.overrides(row) for row in swept.values())
+    refused, valid = swept.values()
     with message.raises(SceneError, "probes.0.at", "sqrt(x - 1)"):
-        plan_file(swept.scene, refused)
-    assert plan_file(swept.scene, valid).scene.probes[0].at == (0.5, 0.0)
+        swept.overrides(refused)
+    assert plan_file(swept.scene, swept.overrides(valid)).scene.probes[0].at == (0.5, 0.0)
 
 
 EXPRESSIONS = {
@@ -223,6 +276,8 @@ EXPRESSIONS = {
     "=min(x, cos(pi)) / (1 + 1)": -0.5,
     "= sin(+x) / sqrt(4)": math.sin(0.5) / 2,
     "=" + "-" * 198 + "1": 1,
+    "=exp(log(abs(-x)))": 0.5,
+    "=floor(-x) + floor(7)": 6,
 }
 
 
@@ -230,6 +285,7 @@ EXPRESSIONS = {
 def test_expressions(text: str) -> None:
     value = evaluate(text, {"x": 0.5})
     assert (value, type(value)) == (EXPRESSIONS[text], type(EXPRESSIONS[text]))
+    evaluate(text, {"x": math.nan})  # the check of a file, before the values are known
 
 
 GOOD = {"scene": "small.yaml", "samples": 2, "vary": {"damping": {"uniform": [0.01, 0.02]}}}
@@ -275,6 +331,7 @@ FAULTS: dict[str, tuple[dict[str, Any], str]] = {
     "section replaced": ({"set": {"springs.shear": 3}, **vary({"choice": [{"shear": 1}]}, "springs")}, "vary"),
     "a variable of texts": ({"variables": {"x": {"choice": ["a"]}}}, "variables.x.choice"),
     "a column": ({"variables": {"seconds": {"uniform": [0, 1]}}}, "variables.seconds"),
+    "not a name": ({"variables": {"x y": {"uniform": [0, 1]}}}, "variables.x y"),
     "a varied key": ({"variables": {"damping": {"uniform": [0, 1]}}}, "variables.damping"),
     "a function": ({"variables": {"max": {"uniform": [0, 1]}}}, "variables.max"),
     "unknown variable": (expression("=radius + 1", radios={"uniform": [0, 1]}), "set.probes.0.force.1"),
@@ -283,6 +340,32 @@ FAULTS: dict[str, tuple[dict[str, Any], str]] = {
     "not allowed": (expression("=__import__('os').getpid()"), "set.probes.0.force.1"),
     "no expression": (expression("=2 x"), "set.probes.0.force.1"),
     "a long expression": (expression("=" + "-" * 200), "set.probes.0.force.1"),
+    "lengths": (
+        {"samples": None, "vary": None, "together": [{"damping": [0.1, 0.2], "springs.shear": [1, 2, 3]}]},
+        "together.0.springs.shear",
+    ),
+    "no keys together": ({"together": [{}]}, "together.0"),
+    "not a group": ({"together": [[1]]}, "together.0"),
+    "samples of a group": ({"together": [{"springs.shear": [1]}]}, "samples"),
+    "unknown key together": ({"samples": None, "vary": None, "together": [{"dampign": [1]}]}, "together.0.dampign"),
+    "twice in groups": (
+        {"samples": None, "vary": None, "together": [{"damping": [1]}, {"springs.shear": [1], "damping": [2]}]},
+        "together.1",
+    ),
+    "a grouped key": (
+        {"samples": None, "vary": None, "variables": {"damping": {"grid": [1]}}, "together": [{"damping": [1]}]},
+        "variables.damping",
+    ),
+    "no values together": ({"together": [{"damping": 3}]}, "together.0.damping"),
+    "not finite together": (
+        {"samples": None, "vary": None, "together": [{"damping": [math.nan]}]},
+        "together.0.damping",
+    ),
+    "no picture together": (
+        {"samples": None, "vary": None, "together": [{"image": ["textures/c.png"]}]},
+        "together.0.image.0",
+    ),
+    "twice": ({"samples": None, **vary({"grid": [1]}), "together": [{"damping": [1]}]}, "together.0"),
     "no calibration": ({"set": {"render.camera.calibration": "a.yml"}}, "set.render.camera.calibration"),
     "combinations": (
         {"samples": None, "vary": {key: {"grid": list(range(4000))} for key in ("damping", "springs.shear")}},

@@ -384,6 +384,16 @@ def test_refused_runs_are_final_and_failed_ones_are_repeated(many: Path, pool: P
     assert [row.status for row in outcomes()] == ["complete", "refused"]
 
 
+def test_expression_without_a_value_is_a_row(small: Path, pool: Pool, message: Messages) -> None:
+    variables, overrides = {"x": {"grid": [0, 0.01]}}, {"damping": "=exp(log(x))", "output": []}
+    for _ in range(2):  # A refused run is checked again.
+        rows = sweep("small.yaml", {}, "out", variables=variables, overrides=overrides, executor=pool)
+        refused, complete = sorted(rows, key=lambda row: row.run)
+        assert (refused.status, complete.status) == ("refused", "complete")
+        assert table("out")[0]["error"] == refused.error
+    message(refused.error, "set.damping", "log(x)")
+
+
 def test_versions_of_another_machine(many: Path, program: Program, message: Messages) -> None:
     begin_sweep(load_sweep("many.yaml"), Path("out"))
     record = json.loads(Path("out/sweep.json").read_text())

@@ -21,6 +21,7 @@ from PIL import Image
 from scipy.stats import qmc
 
 from taichi_msm import sweep
+from taichi_msm.accuracy.companions import MESH_DOUBT, MESH_REMEDY
 from taichi_msm.errors import ForeignError
 from taichi_msm.load.scene_file import parse_override
 from taichi_msm.plot_style import STYLE
@@ -347,6 +348,15 @@ def test_summary_lines(message: Messages) -> None:
     outcomes = [Outcome(run, "complete", "", 0.1, notes=(f"a warning of {run} m",)) for run in range(3)]
     outcomes[0] = Outcome(0, "refused", "damping: too large")
     message(summary_lines(Path("out"), outcomes, (1, 2), [], []), "--shard")
+
+
+def test_warnings_of_the_mesh_are_reported_once(message: Messages) -> None:
+    """Of runs with errors of 5 %, 6 % and 5 %, the warnings are those of the second."""
+    outcomes = []
+    for run, error in enumerate((0.05, 0.06, 0.05)):
+        notes = f"{MESH_DOUBT}: doubt {run}", f"{MESH_REMEDY}, try {run}", f"slip of {run} m"
+        outcomes.append(Outcome(run, "complete", mesh_error=error, notes=notes))
+    message(summary_lines(Path("out"), outcomes, None, ["table.csv"], []), "doubt 1", "try 1", "labels")
 
 
 def test_foreign_files_stay(make: Make, message: Messages) -> None:
