@@ -62,7 +62,7 @@ class SweepSettings(Section):
     vary: dict[str, Distribution] = key(
         {},
         "keys of the scene by their dotted paths, and how each varies; required without variables",
-        "a mapping, such as tissue.young: {uniform: [1e4, 3e4]}",
+        "a mapping, such as tissue.young: {uniform: [1.0e+4, 3.0e+4]}",
     )
     set: dict[str, Any] = key(
         {},
@@ -102,7 +102,7 @@ class SweepSettings(Section):
     def _is_consistent(self) -> Self:
         varied = self.distributions
         if not varied:
-            raise scene_fault("no keys; name at least one, such as tissue.young: {uniform: [1e4, 3e4]}", "vary")
+            raise scene_fault("no keys; name at least one, such as tissue.young: {uniform: [1.0e+4, 3.0e+4]}", "vary")
         if both := self.variables.keys() & self.vary.keys():
             fault = "is also a key of vary, with its column in table.csv; take another name"
             raise scene_fault(fault, "variables", min(both))
