@@ -39,8 +39,8 @@ from taichi_msm.exports.inputs import (
     Pinhole,
     encode_picture,
     read_pinhole,
-    scene_pinhole,
     read_tracks,
+    scene_pinhole,
 )
 from taichi_msm.runs import media
 from taichi_msm.runs.directory import create_file, write_new_file

@@ -189,9 +189,6 @@ def force_warnings(scene: Scene, records: Sequence[ProbeRecord]) -> Iterator[str
     for index, (probe, record) in enumerate(zip(scene.probes, records, strict=True)):
         if probe.moved:
             continue
-        if (pressure := record["largest_pressure"]) > MAX_PRESSURE_PA:
-            fault = f"presses with up to {pressure / 1e6:.3g} MPa, and tissue tears at less"
-            yield f"probes.{index}: {fault}; forces are in newtons, lengths in metres: check force, radius and falloff"
         requested, applied = math.hypot(*(probe.vector or ())) * (probe.total is not None), record["total_force"]
         if requested > 0 and applied <= MIN_FORCE_RATIO * requested:
             yield (
@@ -200,3 +197,6 @@ def force_warnings(scene: Scene, records: Sequence[ProbeRecord]) -> Iterator[str
             )
         elif requested > 0 and applied * MIN_FORCE_RATIO >= requested:
             yield (f"probes.{index}: {applied:.3g} N instead of its {requested:.3g} N, as {cause}")
+        elif (pressure := record["largest_pressure"]) > MAX_PRESSURE_PA:
+            fault = f"presses with up to {pressure / 1e6:.3g} MPa, and tissue tears at less"
+            yield f"probes.{index}: {fault}; forces are in newtons, lengths in metres: check force, radius and falloff"
