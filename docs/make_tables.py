@@ -33,7 +33,7 @@ def rows(section: dict[str, Any], definitions: dict[str, Any], prefix: str = "")
         alternatives = [section, *section.get("anyOf", ())[:1]]
         if any(name in alternative.get("required", ()) for alternative in alternatives):
             default = "**required**"
-        elif below and "anyOf" not in key:
+        elif below and "then" not in key:
             default = "none" if "items" in key else "those below"
         yield f"| `{prefix}{name}` | {key['description']} | {key['expects']} | {default} |"
         for reference in below:
@@ -41,7 +41,7 @@ def rows(section: dict[str, Any], definitions: dict[str, Any], prefix: str = "")
 
 
 def _references(key: dict[str, Any]) -> Iterator[str]:
-    for schema_part in (key, key.get("items", {}), *key.get("anyOf", ())):
+    for schema_part in (key, key.get("items", {}), key.get("then", {}), *key.get("anyOf", ())):
         if "$ref" in schema_part:
             yield schema_part["$ref"].rsplit("/", 1)[-1]
 

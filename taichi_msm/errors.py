@@ -128,14 +128,20 @@ def truncate(text: str) -> str:
     return text if len(text) <= MAX_VALUE_LENGTH else text[:MAX_VALUE_LENGTH] + "..."
 
 
-def did_you_mean(name: str, known: Iterable[str]) -> str:
-    """Return a hint for an unknown name in any case, such as "; did you mean 'top'?"; empty without a similar name."""
+def closest_name(name: str, known: Iterable[str]) -> str:
+    """Return the known name that is similar to an unknown one in any case; empty without a similar name."""
     # Imported here, as only a message needs it.
     from difflib import get_close_matches
 
     # Matching takes time in proportion to the length of the name; a single letter is similar to none.
     matches = get_close_matches(name[:60].lower(), [each for each in known if len(each) > 1], n=1)
-    return f"; did you mean '{matches[0]}'?" if matches and matches[0] != name else ""
+    return matches[0] if matches and matches[0] != name else ""
+
+
+def did_you_mean(name: str, known: Iterable[str]) -> str:
+    """Return a hint for an unknown name, such as "; did you mean 'top'?"; empty without a similar name."""
+    closest = closest_name(name, known)
+    return f"; did you mean '{closest}'?" if closest else ""
 
 
 def windows_path_hint(path: str) -> str:

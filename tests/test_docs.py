@@ -10,6 +10,7 @@ import shlex
 import shutil
 import subprocess
 import sys
+import textwrap
 from collections.abc import Iterator
 from contextlib import nullcontext
 from pathlib import Path
@@ -25,6 +26,7 @@ from taichi_msm.cli import common
 from taichi_msm.cli import options as cli_options
 from taichi_msm.exports.formats import FORMATS
 from taichi_msm.load.scene_file import load_scene, schema
+from taichi_msm.load.yaml_reader import read_yaml
 from taichi_msm.runs.run import run
 from taichi_msm.runs.writer import ErrorRecord, RunRecord
 from taichi_msm.scene import camera, render, scene, sheet, surface, tools
@@ -142,6 +144,14 @@ def test_shown_files_are_the_shipped_ones() -> None:
     assert blocks(DOCS / "sweep.md", "yaml") == [read(ROOT / "scenes" / "sweeps" / "stiffness.yaml")]
     assert blocks(DOCS / "machine-tables.md", "yaml") == [read(ROOT / "examples" / "ball.yaml")]
     assert blocks(DOCS / "view.md", "yaml") == [read(ROOT / "scenes" / "scripts" / "press.yaml")]
+
+
+def test_yaml_of_pages_has_numbers_of_yaml_1_1() -> None:
+    """PyYAML's safe_load, by YAML 1.1, reads the scenes of pages as this parser, by YAML 1.2."""
+    texts = [textwrap.dedent(block) for page in PAGES for block in blocks(page, "yaml")]
+    assert len(texts) >= 5
+    for text in texts:
+        assert yaml.safe_load(text) == read_yaml(text).data, text
 
 
 def test_generated_tables_are_up_to_date() -> None:

@@ -138,7 +138,12 @@ def interruptible(
 
 def print_json(value: Any) -> None:
     """Print a JSON object on stdout."""
-    click.echo(json.dumps(value, indent=2, allow_nan=False))
+    click.echo(format_json(value), nl=False)
+
+
+def format_json(value: Any) -> str:
+    """Format a JSON object as text, with a line break at the end."""
+    return json.dumps(value, indent=2, allow_nan=False) + "\n"
 
 
 def print_result(as_json: bool, record: Mapping[str, Any], lines: Iterable[str], quiet: bool = False) -> None:

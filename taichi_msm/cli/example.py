@@ -11,16 +11,21 @@ from typing import Any
 
 import click
 
-from taichi_msm.cli import options
+from taichi_msm.cli import common, options
 from taichi_msm.errors import FilesError, did_you_mean, printable, writing
 from taichi_msm.runs.directory import replacing
+
+# Name of the file with the JSON Schema of scenes, for editors.
+SCHEMA = "scene.schema.json"
 
 
 @options.program.command()
 @click.argument("name", metavar="[NAME]", required=False)
 @click.argument("directory", metavar="[DIR]", default=".")
 def example(name: str | None, directory: str) -> None:
-    """List the shipped scenes, or write scene NAME with its pictures into DIR, by default the current directory."""
+    """List the shipped scenes, or write scene NAME, its pictures and its schema to DIR, by default this directory."""
+    from taichi_msm.load.scene_file import schema
+
     shipped = scenes_folder()
     scenes = {path.stem: path for pattern in ("*.yaml", "sweeps/*.yaml") for path in sorted(shipped.glob(pattern))}
     if name is None:
@@ -29,15 +34,18 @@ def example(name: str | None, directory: str) -> None:
     if name not in scenes:
         message = f"{name} is not a shipped scene{did_you_mean(name, scenes)}; `taichi-msm example` lists them"
         raise click.BadParameter(message, param_hint="NAME")
-    targets = {path: Path(directory) / path.relative_to(shipped) for path in _files(scenes[name])}
-    for path, target in targets.items():
-        _require_free(path, target, is_scene=path == scenes[name])
-    for path, target in targets.items():
+    names = {path.relative_to(shipped): path for path in _files(scenes[name])}
+    contents = {Path(directory) / path: _with_schema(source, path) for path, source in names.items()}
+    contents[Path(directory) / SCHEMA] = common.format_json(schema()).encode()
+    first, *_ = contents
+    for target, content in contents.items():
+        _require_free(target, content, is_scene=target == first)
+    for target, content in contents.items():
         with writing(target, "DIR"), replacing(target) as file:
-            file.write(path.read_bytes())
+            file.write(content)
         click.echo(printable(str(target)))
     command = "sweep" if "vary" in _content(scenes[name]) else "run"
-    click.echo(printable(f"next: taichi-msm {command} {shlex.quote(str(targets[scenes[name]]))}"))
+    click.echo(printable(f"next: taichi-msm {command} {shlex.quote(str(first))}"))
 
 
 def scenes_folder() -> Path:
@@ -50,6 +58,16 @@ def _content(path: Path) -> Any:
     from taichi_msm.load.yaml_reader import read_yaml
 
     return read_yaml(path.read_text(encoding="utf-8")).data
+
+
+def _with_schema(source: Path, path: Path) -> bytes:
+    """Return the content of a shipped file, of a scene with a comment that names its schema to editors.
+
+    `path` is that of its copy, relative to the folder of the schema.
+    """
+    is_scene = source.suffix == ".yaml" and "sheet" in _content(source)
+    comment = f"# yaml-language-server: $schema={'../' * (len(path.parts) - 1)}{SCHEMA}\n" if is_scene else ""
+    return comment.encode() + source.read_bytes()
 
 
 def _summary(path: Path) -> str:
@@ -75,8 +93,8 @@ def _texts(value: Any) -> Iterator[str]:
             yield from _texts(item)
 
 
-def _require_free(path: Path, target: Path, is_scene: bool) -> None:
+def _require_free(target: Path, content: bytes, is_scene: bool) -> None:
     """Raise a FilesError if a target exists; a file other than the scene may exist with equal content."""
     with writing(target, "DIR"):
-        if target.is_symlink() or (target.exists() and (is_scene or target.read_bytes() != path.read_bytes())):
+        if target.is_symlink() or (target.exists() and (is_scene or target.read_bytes() != content)):
             raise FilesError(f"{target}: exists already; move it away or choose another DIR")

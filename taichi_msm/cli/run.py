@@ -49,9 +49,14 @@ def run(
     recorded = [*overrides, *([f"image={image}"] if image is not None else [])]
     if resume is not None:
         _require_no_settings("--resume continues", ("resume", "threads", "quiet", "as_json"))
+        from taichi_msm.scene.outputs import RUN_RECORD
+
         directory = common.result_directory(resume, option="--resume")
         if not common.resume_hint(directory):
-            raise click.BadParameter(f"there is no unfinished run in {resume}", param_hint="--resume")
+            fault = "has no unfinished run" if directory.is_dir() else "is not a folder"
+            if (directory / RUN_RECORD).is_file():
+                fault = "has a complete run; nothing is left to continue, and --again repeats it"
+            raise click.BadParameter(f"{resume} {fault}", param_hint="--resume")
     elif again is not None:
         allowed = ("again", "out", "arch", "threads", "estimate_error", "quiet", "as_json")
         _require_no_settings("--again repeats", allowed)

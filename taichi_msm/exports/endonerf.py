@@ -24,7 +24,14 @@ from numpy.typing import NDArray
 
 from taichi_msm.errors import ArgumentError, FilesError, ProgressCallback
 from taichi_msm.exports.formats import one_folder_per_run
-from taichi_msm.exports.inputs import Pinhole, encode_picture, read_depth, read_picture_file, read_pinhole
+from taichi_msm.exports.inputs import (
+    Pinhole,
+    encode_picture,
+    read_depth,
+    read_picture_file,
+    read_pinhole,
+    scene_pinhole,
+)
 from taichi_msm.runs.directory import create_file, write_new_file
 from taichi_msm.runs.finished import FinishedRun
 from taichi_msm.scene.outputs import zero_padded
@@ -72,6 +79,11 @@ def _write_run(run: FinishedRun, folder: Path, progress: ProgressCallback) -> li
 
 
 write = one_folder_per_run(_write_run)
+
+
+def check_camera(run: FinishedRun) -> None:
+    """Raise an ArgumentError if the format cannot describe the camera of the run's scene."""
+    _require_central(scene_pinhole(run, FORMAT_NAME), run.scene.render.size, run)
 
 
 def _require_central(camera: Pinhole, size: tuple[int, int], run: FinishedRun) -> None:

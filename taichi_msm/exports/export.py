@@ -144,7 +144,8 @@ def _write_export(
     """Write an export atomically. `camera_runs` has the copies of every run by `_select_cameras`."""
     runs = [run for run, *_ in camera_runs]
     export_format, total, done = FORMATS[name], sum(run.frames for run in runs), 0
-    write: FormatWriter = import_module(f"taichi_msm.exports.{export_format.module or name}").write
+    module = import_module(f"taichi_msm.exports.{export_format.module or name}")
+    write: FormatWriter = module.write
     sources, is_numbered = [], len(runs) > 1
     for number, run in enumerate(runs):
         run_progress = partial(_report_progress, progress, done, run.frames, total)
@@ -156,6 +157,10 @@ def _write_export(
         for run in chain.from_iterable(camera_runs):
             with run.unchanged():
                 if missing := [key for key in export_format.required_outputs if not run.has_output(key)]:
+                    if export_format.checks_camera:
+                        # No outputs help a camera that the format cannot describe.
+                        with _name_run_in_errors(run, name):
+                            module.check_camera(run)
                     remedy = run.remedy(*export_format.required_outputs, *export_format.optional_outputs)
                     raise FilesError(f"{run.directory / run.camera}: {name} needs {' and '.join(missing)}; {remedy}")
         writer = write(sources, publication.new_folder)

@@ -26,6 +26,7 @@ class Format(NamedTuple):
     optional_outputs: tuple[str, ...] = ()  # further exported entries of `output`
     numbers_pairs: bool = False  # whether files are numbered by pair of frames, and not by run
     cameras: tuple[str, ...] = ANY_CAMERA  # names of the exported cameras; empty for a format without camera
+    checks_camera: bool = False  # whether the module has `check_camera(run)`, for cameras that it cannot describe
     module: str = ""  # name of the module; empty for the name of the format
 
 
@@ -47,7 +48,12 @@ FORMATS = {
         numbers_pairs=True,
     ),
     "tapvid": Format("tracks of points", (r"tapvid\.pkl",), required_outputs=("tracks", "png")),
-    "tapvid3d": Format("tracks of points in space", (rf"{NUMBER_PATTERN}\.npz",), required_outputs=("tracks", "png")),
+    "tapvid3d": Format(
+        "tracks of points in space",
+        (rf"{NUMBER_PATTERN}\.npz",),
+        required_outputs=("tracks", "png"),
+        checks_camera=True,
+    ),
     "stir": Format(
         "tracks of points in stereo",
         (
@@ -58,11 +64,13 @@ FORMATS = {
         ),
         required_outputs=("tracks", "png"),
         cameras=("left", "right"),
+        checks_camera=True,
     ),
     "endonerf": Format(
         "neural reconstruction of tissue",
         _patterns_per_run(rf"(?:images|depth|masks)/{NUMBER_PATTERN}\.png", r"poses_bounds\.npy"),
         required_outputs=("depth", "instrument", "png"),
+        checks_camera=True,
     ),
     "rerun": Format(
         "for the viewer of rerun.io",

@@ -9,6 +9,7 @@ from __future__ import annotations
 import io
 import json
 import zipfile
+from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
@@ -20,6 +21,7 @@ from taichi_msm.errors import ArgumentError
 from taichi_msm.exports.formats import ANY_CAMERA, FORMATS
 from taichi_msm.model.mask import Mask
 from taichi_msm.model.surface import Solid, refine_surface
+from taichi_msm.render.camera import view_at
 from taichi_msm.render.texture import load_texture
 from taichi_msm.runs.arrays import read_flo, read_rows
 from taichi_msm.runs.directory import MAX_RECORD_BYTES
@@ -159,19 +161,13 @@ def read_pinhole(run: FinishedRun, name: str) -> Pinhole:
     An orthographic camera or one with lens distortion raises an ArgumentError.
     """
     path = run.directory / run.camera / CAMERA_FILE
-    alternative = "choose another camera by --camera, or " if FORMATS[name].cameras == ANY_CAMERA else ""
     with reading(path):
         # The limit of 32 MiB suffices for 100,000 poses.
         camera = json.loads(read_regular(run.require_regular_file(path, FORMATS[name].required_outputs[0]), 1 << 25))
         # Lens models other than pinhole distort even if all coefficients are 0.
         is_distorted = camera.get("model", "pinhole") != "pinhole" or bool(np.any(camera.get("distortion", ())))
         is_pinhole = "intrinsics" in camera
-    if not is_pinhole:
-        fault = f"{name} needs a pinhole camera, and {path} is orthographic"
-        raise ArgumentError(f"{fault}; {alternative}run the scene with a pinhole camera")
-    if is_distorted:
-        fault = f"{path}: the camera has lens distortion, which {name} cannot describe"
-        raise ArgumentError(f"{fault}; {alternative}run the scene without distortion")
+    _require_pinhole(path, name, is_pinhole=is_pinhole, is_distorted=is_distorted)
     with reading(path):
         matrix = np.array(camera["intrinsics"], float)
         poses = np.array(camera.get("poses", [camera["pose"]] * run.frames), float)[: run.frames]
@@ -181,6 +177,23 @@ def read_pinhole(run: FinishedRun, name: str) -> Pinhole:
         if not (np.isfinite(matrix).all() and (focal > 0).all()):
             raise damaged_result(path)
     return Pinhole(focal, centre, poses)
+
+
+def scene_pinhole(run: FinishedRun, name: str) -> Pinhole:
+    """Return the camera of a run's scene at its start as `read_pinhole`, for a run without the required outputs."""
+    view = view_at(run.scene, 0.0, run.camera)
+    _require_pinhole(run.directory / run.camera, name, is_pinhole=view.pinhole, is_distorted=view.lens is not None)
+    return Pinhole(view.scale, view.centre, np.zeros((0, 3, 4)))
+
+
+def _require_pinhole(path: Path, name: str, *, is_pinhole: bool, is_distorted: bool) -> None:
+    alternative = "choose another camera by --camera, or " if FORMATS[name].cameras == ANY_CAMERA else ""
+    if not is_pinhole:
+        fault = f"{name} needs a pinhole camera, and {path} is orthographic"
+        raise ArgumentError(f"{fault}; {alternative}run the scene with a pinhole camera")
+    if is_distorted:
+        fault = f"{path}: the camera has lens distortion, which {name} cannot describe"
+        raise ArgumentError(f"{fault}; {alternative}run the scene without distortion")
 
 
 def instrument_mesh(solid: Solid) -> tuple[Array, Array, NDArray[np.int32]]:

@@ -34,7 +34,14 @@ from numpy.typing import NDArray
 
 from taichi_msm.errors import FilesError, NotInstalledError, ProgressCallback
 from taichi_msm.exports.formats import one_path_per_run
-from taichi_msm.exports.inputs import FIRST_PIXEL_CENTRE, Pinhole, encode_picture, read_pinhole, read_tracks
+from taichi_msm.exports.inputs import (
+    FIRST_PIXEL_CENTRE,
+    Pinhole,
+    encode_picture,
+    read_pinhole,
+    read_tracks,
+    scene_pinhole,
+)
 from taichi_msm.runs import media
 from taichi_msm.runs.directory import create_file, write_new_file
 from taichi_msm.runs.finished import FinishedRun
@@ -72,6 +79,11 @@ def _write_run(run: FinishedRun, folder: Path, progress: ProgressCallback) -> li
 
 
 write = one_path_per_run(_write_run)
+
+
+def check_camera(run: FinishedRun) -> None:
+    """Raise an ArgumentError unless the camera of the run's scene is a pinhole without distortion."""
+    scene_pinhole(run, FORMAT_NAME)
 
 
 def _baseline(run: FinishedRun, left: Pinhole, right: Pinhole) -> float:

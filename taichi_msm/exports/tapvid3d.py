@@ -25,7 +25,7 @@ from numpy.typing import NDArray
 
 from taichi_msm.errors import ProgressCallback
 from taichi_msm.exports.formats import one_path_per_run
-from taichi_msm.exports.inputs import encode_picture, read_pinhole, read_track_positions, read_tracks
+from taichi_msm.exports.inputs import encode_picture, read_pinhole, read_track_positions, read_tracks, scene_pinhole
 from taichi_msm.runs.arrays import write_arrays
 from taichi_msm.runs.directory import create_file
 from taichi_msm.runs.finished import FinishedRun
@@ -59,3 +59,8 @@ def _write_run(run: FinishedRun, path: Path, progress: ProgressCallback) -> list
 
 
 write = one_path_per_run(_write_run, ".npz")
+
+
+def check_camera(run: FinishedRun) -> None:
+    """Raise an ArgumentError unless the camera of the run's scene is a pinhole without distortion."""
+    scene_pinhole(run, "tapvid3d")

@@ -7,7 +7,7 @@ from typing import Any, TypeVar
 
 from pydantic import ValidationError
 
-from taichi_msm.errors import ArgumentError, Key, Problem, SceneError
+from taichi_msm.errors import ArgumentError, Key, Problem, SceneError, closest_name
 from taichi_msm.load import cost
 from taichi_msm.model.plan import Plan
 from taichi_msm.model.sheet import Maps
@@ -55,7 +55,15 @@ def validate(data: dict[str, Any]) -> tuple[Plan | None, list[Problem]]:
             ]
             break
         data = _replace_faulty(data, new_problems)
+    if any(problem.path[:2] == ("sheet", "surface") and _hides_kind(problem) for problem in problems):
+        # The camera of some surfaces needs no eye.
+        problems = [problem for problem in problems if (problem.path[:1], problem.path[-1:]) != (("render",), ("eye",))]
     return (None if problems else plan), problems
+
+
+def _hides_kind(problem: Problem) -> bool:
+    """Return whether the kind of the surface is unknown because of its problem."""
+    return len(problem.path) == 2 or (len(problem.path) == 3 and problem.is_unknown_key)
 
 
 def value_at(data: Any, key: Key) -> Any:
@@ -107,6 +115,9 @@ def check_scene(scene: Plan | Scene | Mapping[str, Any], maps: Maps | None = Non
 def _replace_faulty(data: dict[str, Any], problems: list[Problem]) -> dict[str, Any]:
     """Replace faulty sections by valid ones, and remove outputs that depend on them."""
     faulty = {problem.path[0] for problem in problems}
+    # The section that a misspelt one means is not missing.
+    meant = {closest_name(str(problem.path[0]), Scene.model_fields) for problem in problems if problem.is_unknown_key}
+    faulty |= meant - data.keys()
     if "image" in faulty:
         faulty.add("output")
     output = data.get("output")

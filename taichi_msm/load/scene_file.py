@@ -136,7 +136,35 @@ def camera_files(data: Mapping[str, Any]) -> list[tuple[Key, str]]:
 
 def schema() -> dict[str, Any]:
     """Return the JSON Schema (draft 2020-12) of a scene, with the rules for single keys, not for combinations."""
-    return {"$schema": "https://json-schema.org/draft/2020-12/schema"} | Scene.model_json_schema()
+    described = {"$schema": "https://json-schema.org/draft/2020-12/schema"} | Scene.model_json_schema()
+    _separate_sections(described)
+    return described
+
+
+_NULL = {"type": "null"}
+
+
+def _separate_sections(part: Any) -> None:
+    """Replace unions with null or with a section in a JSON Schema, so that errors name a key or an item within."""
+    if isinstance(part, list):
+        for item in part:
+            _separate_sections(item)
+    elif isinstance(part, dict):
+        for value in part.values():
+            _separate_sections(value)
+        members = part.get("anyOf", ())
+        sections = [member for member in members if member.keys() == {"$ref"}]
+        others = [member for member in members if member not in sections]
+        if len(sections) == 1:
+            del part["anyOf"]
+            part |= {"if": {"type": "object"}, "then": sections[0]}
+            part |= {"type": ["object", "null"]} if others == [_NULL] else {"else": {"anyOf": others}}
+        elif len(others) == 2 and others[1] == _NULL and "type" in others[0]:
+            # The other rules of a type do not apply to null, except for a list of values.
+            del part["anyOf"]
+            part |= others[0] | {"type": [others[0]["type"], "null"]}
+            if "enum" in part:
+                part["enum"] = [*part["enum"], None]
 
 
 class Override(NamedTuple):

@@ -95,6 +95,8 @@ def _syntax_error(text: str, error: yaml.MarkedYAMLError) -> UnreadableError:
     hint = "; indent with spaces, not tabs" if text[index : index + 1] == "\t" else ""
     if error.problem == "mapping values are not allowed in this context":
         hint = "; write one KEY: VALUE a line, also in the line before"
+    if re.search("escape|hexdecimal", str(error.problem)):
+        hint = "; put a path with \\ in single quotes, or write it with forward slashes"
     reason = " ".join(part for part in (error.problem, error.context) if part)
     return UnreadableError(_mark(mark) if mark else Mark(1, 1), f"not valid YAML: {reason}{hint}")
 

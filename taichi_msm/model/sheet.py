@@ -254,7 +254,9 @@ def tissue_problems(scene: Scene, fixed: NDArray[np.bool_], factors: Array | Non
             f"{MAX_CELL_ASPECT:.3g} times; {remedy}",
         )
     if tissue.foundation_map is not None and tissue.foundation_stiffness == 0:
-        text = "needs a foundation; set tissue.foundation, such as {young: 15e3, depth: 0.05}, or remove foundation_map"
+        text = (
+            "needs a foundation; set tissue.foundation, such as {young: 15.0e+3, depth: 0.05}, or remove foundation_map"
+        )
         yield Problem(("tissue", "foundation_map"), text)
     if len(tissue.relaxation) > MAX_BRANCHES:
         text = f"{len(tissue.relaxation)} branches are too many; take at most {MAX_BRANCHES}"

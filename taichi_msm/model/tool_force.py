@@ -32,6 +32,9 @@ from taichi_msm.scene.tools import Probe
 # A warning is issued if the ratio of the force on the sheet to `total` is below this value or above its inverse.
 MIN_FORCE_RATIO = 0.8
 
+# Largest pressure of a tool without a warning [Pa].
+MAX_PRESSURE_PA = 1e6
+
 
 class ProbeForce(NamedTuple):
     """The force law of a probe: force exp(-max(falloff d + shift, offset)) on a mass point at the distance d."""
@@ -177,7 +180,7 @@ def describe_forces(record: ProbeRecord) -> str:
 
 
 def force_warnings(scene: Scene, records: Sequence[ProbeRecord]) -> Iterator[str]:
-    """Yield warnings of probes whose forces on this sheet, from `probe_records`, do not add up to their `total`."""
+    """Yield warnings of probes, from `probe_records`, with implausible pressures or not all of their `total`."""
     across, down = rest_of(scene.sheet).cell_sides
     cell = f"a cell of {across:.3g} x {down:.3g} m"
     cause = f"the tool is narrower than {cell}"
@@ -194,3 +197,6 @@ def force_warnings(scene: Scene, records: Sequence[ProbeRecord]) -> Iterator[str
             )
         elif requested > 0 and applied * MIN_FORCE_RATIO >= requested:
             yield (f"probes.{index}: {applied:.3g} N instead of its {requested:.3g} N, as {cause}")
+        elif (pressure := record["largest_pressure"]) > MAX_PRESSURE_PA:
+            fault = f"presses with up to {pressure / 1e6:.3g} MPa, and tissue tears at less"
+            yield f"probes.{index}: {fault}; forces are in newtons, lengths in metres: check force, radius and falloff"

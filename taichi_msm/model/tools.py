@@ -274,8 +274,36 @@ class SolidTool(Tool):
             f"instrument; move at most {self.stride_limit / grid.step:.3g} m/s, or take a smaller step"
         )
 
+    def places_at(self, t: Array, sheet: Sheet) -> Array:
+        """Return across and down of the tip at times [s], shape (n, 2)."""
+        return rest_of(sheet).fractions(self.path_at(t)[:, :2])
+
     def warnings(self, scene: Scene) -> Iterator[str]:
         yield from self._length_warnings("height", float(np.abs(self.heights).max()), scene.sheet)
+        places = self.places_at(self.times, scene.sheet)
+        outside = ((places < -1e-9) | (places > 1 + 1e-9)).any(axis=1)
+        # A tool may come from beyond an edge, above the sheet.
+        if outside.all() or (outside & (self.heights <= 0)).any():
+            first = int(np.flatnonzero(outside & ((self.heights <= 0) | outside.all()))[0])
+            place = f"{places[first, 0]:g} across and {places[first, 1]:g} down"
+            yield (
+                f"probes.{self.probe}.path: at {self.times[first]:g} s the tip is outside the sheet, at {place}; on "
+                "the sheet both are 0 to 1, as fractions of its width and height"
+            )
+        yield from self._grip_warnings(scene)
+
+    def _grip_warnings(self, scene: Scene) -> Iterator[str]:
+        """Yield warnings of grips that begin in a hole or outside the sheet, farther from it than they hold."""
+        rest = rest_of(scene.sheet)
+        for begin, until in self.grips:
+            places = self.places_at(np.array([begin]), scene.sheet)
+            point = rest.place(rest.coordinates(places))
+            is_sheet = np.ones(scene.sheet.points, bool) if rest.mask is None else rest.mask.points
+            gap = float(np.linalg.norm(rest.position[is_sheet] - point, axis=1).min())
+            covered = ((places >= 0) & (places <= 1)).all() if rest.mask is None else rest.mask.covers(places)[0]
+            if not covered and gap > GRIP_RADII * self.radius:
+                fault = f"holds nothing of the sheet at rest, which is {gap:.3g} m from the tip"
+                yield f"probes.{self.probe}.grip from {begin:g} to {until:g} s {fault}; move path onto the sheet"
 
 
 @dataclass(frozen=True, eq=False)
@@ -310,6 +338,9 @@ class FollowingTool(SolidTool):
         first, last = (np.clip(np.floor(places * count).astype(int) + n, 0, count) for n in (-1, 2))
         windows = ((down[i:k, j : m + 1], across[i : k + 1, j:m]) for (j, i), (m, k) in zip(first, last, strict=True))
         return max(float(np.nan_to_num(each).max(initial=0.0)) for window in windows for each in window)
+
+    def places_at(self, t: Array, sheet: Sheet) -> Array:  # noqa: ARG002
+        return _interpolate(t, self.times, self.places)
 
     def direction_at(self, t: float) -> Array:
         return self._follow(np.array([t]))[1][0]

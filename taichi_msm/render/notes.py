@@ -26,6 +26,8 @@ def drawing_warnings(scene: Scene) -> Iterator[str]:
     """Yield warnings about the rendering of a scene, one line each."""
     if scene.sheet.unit_hint:
         yield scene.sheet.unit_hint
+    if scene.tissue and scene.tissue.unit_hint:
+        yield scene.tissue.unit_hint
     if scene.draws:
         yield from _stretched_picture(scene)
         if texture.is_see_through(scene):

@@ -6,6 +6,7 @@ Every error is reported at its key, with the values that the key may have.
 from __future__ import annotations
 
 import json
+import re
 from collections import defaultdict
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from itertools import islice, pairwise
@@ -17,7 +18,16 @@ from pydantic.fields import FieldInfo
 from pydantic_core import ErrorDetails, PydanticCustomError
 from typing_extensions import Self
 
-from taichi_msm.errors import ArgumentError, Key, Problem, SceneError, did_you_mean, truncate
+from taichi_msm.errors import (
+    MAX_VALUE_LENGTH,
+    ArgumentError,
+    Key,
+    Problem,
+    SceneError,
+    closest_name,
+    did_you_mean,
+    truncate,
+)
 from taichi_msm.scene.outputs import ENTRIES
 
 # Limits of a number's magnitude, so that products and quotients of two numbers neither overflow nor underflow.
@@ -56,7 +66,7 @@ def key_problems(error: ValidationError, section: type[BaseModel], data: Any) ->
     faults = [_locate(details, section) for details in errors]
     return [
         Problem(fault.path, _message(fault, data), is_unknown_key=fault.kind == "extra_forbidden")
-        for fault in _merge_missing_items(_choose_members(faults))
+        for fault in _merge_misspelt(_merge_missing_items(_choose_members(faults)))
     ]
 
 
@@ -150,6 +160,61 @@ def _merge_missing_items(faults: Iterable[_Fault]) -> Iterator[_Fault]:
     return (fault for fault in merged if fault.kind != "too_short" or fault.path not in parents)
 
 
+def _merge_misspelt(faults: Iterable[_Fault]) -> Iterator[_Fault]:
+    """Drop the fault of a missing key if an unknown key of its section is similar, whose message suggests it."""
+    merged = list(faults)
+    meant = {
+        (*fault.path[:-1], closest_name(str(fault.path[-1]), fault.section.model_fields))
+        for fault in merged
+        if fault.kind == "extra_forbidden"
+    }
+    return (fault for fault in merged if fault.kind != "missing" or fault.path not in meant)
+
+
+# Units that a value may have been given in: the word for the SI unit in `expects`, and the factor to it.
+_UNITS: dict[str, tuple[str, float]] = {
+    **{"Pa": ("Pa", 1), "kPa": ("Pa", 1e3), "MPa": ("Pa", 1e6), "GPa": ("Pa", 1e9), "mmHg": ("Pa", 133.322)},
+    **{"m": ("metres", 1), "cm": ("metres", 1e-2), "mm": ("metres", 1e-3), "um": ("metres", 1e-6)},
+    **{"µm": ("metres", 1e-6), "μm": ("metres", 1e-6), "s": ("seconds", 1), "ms": ("seconds", 1e-3)},
+    **{"N": ("newtons", 1), "mN": ("newtons", 1e-3), "kN": ("newtons", 1e3), "kg": ("kg", 1), "g": ("kg", 1e-3)},
+    **{"kg/m3": ("kg/m3", 1), "kg/m^3": ("kg/m3", 1), "g/cm3": ("kg/m3", 1e3), "g/cm^3": ("kg/m3", 1e3)},
+    **{"N/m": ("N/m", 1), "N/mm": ("N/m", 1e3), "mN/mm": ("N/m", 1), "g/ml": ("kg/m3", 1e3)},
+}
+_QUANTITY = re.compile(r"([-+]?(?:[0-9]+(?:[.,][0-9]*)*|[.,][0-9]+)(?:[eE][-+]?[0-9]+)?)\s*([^\W\d_][^\s]*)?")
+
+
+def _number_hint(text: str, expected: str) -> str:
+    """Return a hint with the number to write for a text such as "30 kPa" or "3,0e4"; empty for other texts."""
+    match = _QUANTITY.fullmatch(text.strip())
+    if match is None or len(text) > MAX_VALUE_LENGTH:
+        return ""
+    digits, unit = match[1], match[2]
+    if re.fullmatch("[-+]?[1-9][0-9]{0,2}(,[0-9]{3})+", digits):
+        alternative = f" or {digits.replace(',', '.')}" if digits.count(",") == 1 else ""
+        return f"; write {digits.replace(',', '')}{alternative}, the number in SI units, without a comma"
+    digits = digits.replace(",", ".")
+    try:
+        value = float(digits)
+    except ValueError:  # several points
+        return ""
+    if unit is None:
+        reason = "with a point" if "," in text else "without quotes"
+        return f"; write {digits}, {reason}"
+    name, factor = _UNITS.get(unit, ("", 1.0))
+    long_names = expected.replace("in m,", "in metres,").replace("in s,", "in seconds,")
+    if not name or f"in {name}," not in f"{long_names},":
+        return "; write the number alone, in SI units, such as 3.0e4 for 30 kPa"
+    return f"; write {_shortest(value * factor)}, the number in {name}"
+
+
+def _shortest(value: float) -> str:
+    """Format a number as in a scene file, such as 0.003 or 3.0e4."""
+    if value == 0 or 1e-3 <= abs(value) < 1e4:
+        return f"{value:.10g}"
+    mantissa, exponent = f"{value:.9e}".split("e")
+    return f"{float(mantissa)}e{int(exponent)}"
+
+
 def _message(fault: _Fault, data: Any) -> str:
     """Format a fault with the allowed values."""
     if fault.kind == SCENE_FAULT:
@@ -170,7 +235,11 @@ def _message(fault: _Fault, data: Any) -> str:
     if limit in (MAX_MAGNITUDE, -MAX_MAGNITUDE) or (limit == MIN_MAGNITUDE and data > 0):
         return f"{format_value(data)} is out of range; magnitudes are {MIN_MAGNITUDE:g} to {MAX_MAGNITUDE:g}"
     is_item = isinstance(fault.path[-1], int)
-    hint = did_you_mean(data, _literals(fault.field.annotation, is_item)) if isinstance(data, str) else ""
+    hint = ""
+    if isinstance(data, str):
+        hint = did_you_mean(data, _literals(fault.field.annotation, is_item)) or _number_hint(data, expected)
+    elif isinstance(data, Mapping) and data and expected.startswith("expected a list"):
+        hint = f"; begin each item with a dash: - {next(iter(data))}: ..."
     return f"{format_value(data)} is not allowed; {expected}{hint}"
 
 

@@ -29,7 +29,7 @@ from taichi_msm.scene.section import (
     key,
     scene_fault,
 )
-from taichi_msm.scene.surface import KeptGrid, PointGrid, RestSurface
+from taichi_msm.scene.surface import KINDS, KeptGrid, PointGrid, RestSurface
 
 if TYPE_CHECKING:
     import numpy as np
@@ -137,6 +137,9 @@ class Sheet(Section):
     def _complete_sizes(cls, data: Any) -> Any:
         """Add to `surface.points` the number of points of its file, unless it is given, and an unused size."""
         surface = data.get("surface") if isinstance(data, Mapping) else None
+        names_kind = surface.keys() & KINDS if isinstance(surface, Mapping) else isinstance(surface, RestSurface)
+        if surface is not None and not names_kind:
+            return {"points": (2, 2), "size": (1.0, 1.0), **data}  # The fault of the surface comes alone.
         grid, depth = (
             surface.get(name) if isinstance(surface, Mapping) else getattr(surface, name, None)
             for name in ("points", "depth")
@@ -348,6 +351,14 @@ class Tissue(Section):
     foundation_map: StiffnessMap | None = key(
         None, "map of factors of the foundation", "a mapping with image and range"
     )
+
+    @property
+    def unit_hint(self) -> str:
+        """Warning about a thickness that is probably in millimetres; empty for a sheet of up to 0.1 m."""
+        if self.thickness <= 0.1:
+            return ""
+        remedy = f"if this is in millimetres, take {self.thickness / 1000:g}"
+        return f"tissue.thickness: {self.thickness:g} m is thick for a sheet of tissue; {remedy}"
 
     @property
     def foundation_stiffness(self) -> float:

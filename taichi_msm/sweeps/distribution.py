@@ -95,7 +95,7 @@ class Distribution(_Continuous):  # type: ignore[misc]
             remedy = "take one such as {uniform: [1, 2]} or {choice: [1, 2]}"
             raise scene_fault(f"{format_value(data)} is not a distribution; {remedy}")
         if data.keys().isdisjoint(cls.model_fields) and any(isinstance(value, dict) for value in data.values()):
-            raise scene_fault("give each key by its dotted path, such as tissue.young: {uniform: [1e4, 3e4]}")
+            raise scene_fault("give each key by its dotted path, such as tissue.young: {uniform: [1.0e+4, 3.0e+4]}")
         return data
 
     @field_validator(*CONTINUOUS)

@@ -62,13 +62,13 @@ class SweepSettings(Section):
     vary: dict[str, Distribution] = key(
         {},
         "keys of the scene by their dotted paths, and how each varies; required without variables and together",
-        "a mapping, such as tissue.young: {uniform: [1e4, 3e4]}",
+        "a mapping, such as tissue.young: {uniform: [1.0e+4, 3.0e+4]}",
     )
     together: list[dict[str, NonEmptyList]] = key(
         [],
         "groups of keys of the scene by their dotted paths, each with a list of values; the keys of a group vary row "
         "by row, and each group is a grid",
-        "a list of mappings from keys to lists, such as [{tissue.young: [1e4, 2e4], tissue.thickness: [1e-3, 2e-3]}]",
+        "a list of mappings from keys to lists, such as [{tissue.young: [1.0e+4, 2.0e+4], tissue.thickness: [1.0e-3, 2.0e-3]}]",
     )
     set: dict[str, Any] = key(
         {},
@@ -132,7 +132,7 @@ class SweepSettings(Section):
     def _is_consistent(self) -> Self:
         varied = self.distributions
         if not varied:
-            raise scene_fault("no keys; name at least one, such as tissue.young: {uniform: [1e4, 3e4]}", "vary")
+            raise scene_fault("no keys; name at least one, such as tissue.young: {uniform: [1.0e+4, 3.0e+4]}", "vary")
         places: list[Key] = [("set", name) for name in self.set]
         places += [("vary", name) for name in self.vary]
         places += [("together", index, name) for index, group in enumerate(self.together) for name in group]

@@ -254,6 +254,12 @@ def call(capsys: pytest.CaptureFixture[str]) -> Call:
     return call
 
 
+def test_nothing_to_continue_in_a_complete_run(results: Path, program: Program, message: Messages) -> None:
+    resumed = program("run", "--resume", str(results))
+    assert resumed.returncode == 2
+    message(resumed.stderr, "complete run")
+
+
 WRONG: dict[str, list[str]] = {
     "no scene": ["run", "nowhere.yaml"],
     "keys": ["check", "small.yaml", "--set", "springs.shaer=3", "--set", "sheet.mass=0"],
@@ -261,6 +267,7 @@ WRONG: dict[str, list[str]] = {
     "empty folder": ["run", "small.yaml", "--out", ""],
     "again and scene": ["run", "--again", "out", "small.yaml"],
     "nothing to resume": ["run", "--resume", "nowhere"],
+    "unfinished run in an empty folder": ["run", "--resume", "."],
     "resume and scene": ["run", "small.yaml", "--resume", "out"],
     "no argument": ["run"],
     "blank in a value": ["check", "a.yaml", "--set", "sheet.points=[61,", "61]"],

@@ -2,7 +2,11 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
+
+import jsonschema
+import yaml
 
 from taichi_msm.cli import example
 from taichi_msm.load.scene_file import load_plan
@@ -45,6 +49,20 @@ def test_no_file_is_overwritten(tmp_path: Path, program: Program, message: Messa
     unknown = program("example", "pres")
     assert unknown.returncode == 2
     message(unknown.stderr, "press")
+
+
+def test_schema_for_editors(tmp_path: Path, program: Program) -> None:
+    """Every scene names the schema next to the written ones, which accepts it as read by YAML 1.1."""
+    for name, scene in (("press", "press.yaml"), ("tracking", "sweeps/tracking-scene.yaml")):
+        program("example", name, str(tmp_path))
+        text = (tmp_path / scene).read_text(encoding="utf-8")
+        comment, named = text.splitlines()[0].split("$schema=")
+        assert comment == "# yaml-language-server: "
+        schema = (tmp_path / scene).parent / named
+        assert schema.resolve() == tmp_path / "scene.schema.json"
+        jsonschema.validate(yaml.safe_load(text), json.loads(schema.read_text(encoding="utf-8")))
+    assert schema.read_text(encoding="utf-8") == program("schema").stdout
+    assert (tmp_path / "sweeps" / "tracking.yaml").read_text(encoding="utf-8").count("$schema") == 0
 
 
 def test_wheel_contains_the_scenes(root: Path) -> None:

@@ -23,9 +23,10 @@ import pytest
 from numpy.typing import NDArray
 from PIL import Image
 
-from taichi_msm import ArgumentError, FilesError, export
+from taichi_msm import ArgumentError, FilesError, export, run
 from tests.exports.test_cameras import describe
 from tests.golden import Messages
+from tests.scenes import scene
 
 FRAMES, WIDTH, HEIGHT, UNIT = 3, 40, 32, 1e-5
 
@@ -110,3 +111,19 @@ def test_unsupported_cameras(labelled_in_motion: Path, tmp_path: Path, message: 
     Image.fromarray(np.zeros((HEIGHT, WIDTH), np.float32)).save(run / "depth/0001.tiff")
     with message.raises(FilesError):
         export(run, "endonerf")
+
+
+@pytest.mark.parametrize("name", ["endonerf", "tapvid3d", "stir"])
+def test_camera_is_refused_before_outputs_are_asked_for(name: str, tmp_path: Path, message: Messages) -> None:
+    """A run without the outputs of the format, whose camera it cannot describe, is refused for the camera."""
+    intrinsics = {"fx": 45, "fy": 45, "cx": 22, "cy": 16.5}
+    cameras: dict[str, dict[str, object]] = {"distortion": {"intrinsics": intrinsics, "distortion": {"k1": 0.01}}}
+    if name == "endonerf":
+        cameras["principal point"] = {"intrinsics": intrinsics}
+    for word, optics in cameras.items():
+        left = {"eye": [0, 0, 0.5], **optics}
+        pair = {"cameras": {"left": left, "right": {"beside": "left", "baseline": 0.01}}}
+        render = {"size": (WIDTH, HEIGHT), **(pair if name == "stir" else {"camera": left})}
+        run(scene(output=["trajectory"], render=render, time={"duration": 0.04}), tmp_path / word)
+        with message.raises(ArgumentError, word):
+            export(tmp_path / word, name)

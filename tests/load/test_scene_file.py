@@ -11,11 +11,13 @@ from typing import Any
 import jsonschema
 import numpy as np
 import pytest
+import yaml
 from PIL import Image
 
 from taichi_msm.errors import SceneError, printable
 from taichi_msm.load.check import parse_model
 from taichi_msm.load.scene_file import MAX_LINES, load_scene, parse_override, schema
+from taichi_msm.load.yaml_reader import read_yaml
 from taichi_msm.model.rest import rest_of
 from taichi_msm.scene.scene import Scene
 from taichi_msm.scene.sheet import Sheet
@@ -435,6 +437,27 @@ def test_schema_accepts_valid_scenes(load: Load, validator: jsonschema.Draft2020
         validator.validate(parse_override(f"scene={text}").value)
 
 
+@pytest.mark.parametrize(
+    ("section", "path"),
+    [
+        ({"springs": {"shear": -1}}, ["springs", "shear"]),
+        ({"springs": {"shaer": 1}}, ["springs"]),
+        ({"springs": 3}, ["springs"]),
+        ({"render": {"camera": {"eye": [0, 0, 1], "fov": -3}}}, ["render", "camera", "fov"]),
+        ({"render": {"camera": {"eye": [0, 0, 1], "fvo": 3}}}, ["render", "camera"]),
+        ({"probes": [{"path": [[0, 0, 0, 0]], "instrument": {"radius": 0, "shaft": [0, 0, 1], "length": 1}}]},
+         ["probes", 0, "instrument", "radius"]),
+    ],
+    ids=["value", "unknown key", "number", "value in a union", "unknown key in a union", "value of a tool"],
+)  # fmt: skip
+def test_schema_blames_one_key(section: dict[str, Any], path: list[Any], validator: jsonschema.Validator) -> None:
+    """An editor marks one key, and not the optional section that contains it as of no type of a union."""
+    good = parse_override(f"scene={GOOD}").value
+    (error,) = validator.iter_errors(good | section)
+    assert list(error.absolute_path) == path
+    assert error.validator not in ("anyOf", "oneOf")
+
+
 def test_schema_rejects_invalid_scenes(validator: jsonschema.Draft202012Validator) -> None:
     good = parse_override(f"scene={GOOD}").value
     assert validator.is_valid(good)
@@ -471,3 +494,72 @@ def test_changed_file_of_a_surface_is_read_again(tmp_path: Path) -> None:
     for value in (1.0, 2.0, 2.0):
         np.save(tmp_path / "z.npy", np.full((3, 3), value))
         assert heights() == pytest.approx(value / 1000)
+
+
+TISSUE = """\
+sheet:
+  points: [4, 5]
+  size: [0.3, 0.4]
+tissue:
+  young: 3.0e+4
+  thickness: 0.003
+  density: 1050
+  foundation: 10
+time:
+  duration: 0.4
+output: []
+"""
+
+
+@pytest.mark.parametrize(
+    ("key", "text", "number"),
+    [
+        ("young", "30 kPa", "write 3.0e4, the number in Pa"),
+        ("young", "0.03MPa", "write 3.0e4, the number in Pa"),
+        ("young", "3,0e4", "write 3.0e4, with a point"),
+        ("young", '"3.0e4"', "write 3.0e4, without quotes"),
+        ("thickness", "3 mm", "write 0.003, the number in metres"),
+        ("thickness", "0,003", "write 0.003, with a point"),
+        ("density", "1,050", "write 1050 or 1.050,"),
+        ("density", "1.05 g/cm3", "write 1050, the number in kg/m3"),
+        ("density", "10 N", "write the number alone, in SI units"),
+        ("foundation", "30 kPa", "write the number alone, in SI units"),
+        ("young", "1.2.3", "expected a number above 0, in Pa"),
+        ("young", "soft", "expected a number above 0, in Pa"),
+    ],
+)
+def test_number_to_write(key: str, text: str, number: str, load: Load, message: Messages) -> None:
+    with message.raises(SceneError, f"tissue.{key}: ", number):
+        load("\n".join(f"  {key}: {text}" if line.startswith(f"  {key}:") else line for line in TISSUE.splitlines()))
+
+
+SINGLE_FAULTS = {
+    "list without dashes": (GOOD + PROBE.replace("  - force", "    force"), "begin each item with a dash: - force: "),
+    "path in double quotes": (GOOD + 'image: "C:\\Users\\a.png"\n', "single quotes, or write it with forward slashes"),
+    "another path": (GOOD + 'image: "D:\\pictures\\a.png"\n', "single quotes, or write it with forward slashes"),
+    "misspelt key": (TISSUE.replace("young", "yuong"), "tissue.yuong: unknown key; did you mean 'young'?"),
+    "misspelt section": (TISSUE.replace("tissue:", "tisue:"), "tisue: unknown key; did you mean 'tissue'?"),
+    "misspelt sheet": (TISSUE.replace("sheet:", "shete:"), "shete: unknown key; did you mean 'sheet'?"),
+    "surface as a text": (TISSUE.replace("size: [0.3, 0.4]", "surface: depth.png"), 'sheet.surface: "depth.png" is'),
+    "misspelt kind of surface": (
+        TISSUE.replace("size: [0.3, 0.4]", "surface: {dpeth: {file: d.png, unit: mm}}"),
+        "sheet.surface.dpeth: unknown key; did you mean 'depth'?",
+    ),
+}
+
+
+@pytest.mark.parametrize("name", SINGLE_FAULTS)
+def test_one_fault_is_one_error(name: str, load: Load, message: Messages) -> None:
+    text, expected = SINGLE_FAULTS[name]
+    with message.raises(SceneError, expected, hide=PYYAML_TEXT) as caught:
+        load(text + ("render: {camera: {fov: 60}}\n" if "surface" in name else ""))
+    assert len(caught.value.lines) == 1
+
+
+def test_yaml_1_1_reads_the_numbers_of_shipped_scenes(root: Path) -> None:
+    """PyYAML's safe_load, by YAML 1.1, and this parser, by YAML 1.2, give equal data."""
+    shipped = [path for folder in ("scenes", "examples", "docs") for path in sorted((root / folder).rglob("*.yaml"))]
+    assert len(shipped) > 15
+    for path in shipped:
+        text = path.read_text(encoding="utf-8")
+        assert yaml.safe_load(text) == read_yaml(text).data, path
