@@ -26,6 +26,9 @@ def drawing_warnings(scene: Scene) -> Iterator[str]:
     """Yield warnings about the rendering of a scene, one line each."""
     if scene.sheet.unit_hint:
         yield scene.sheet.unit_hint
+    for name, camera in scene.render.all_cameras.items():
+        if isinstance(camera, Camera) and camera.note:
+            yield f"render.{f'cameras.{name}' if name else 'camera'}.poses: {camera.note}"
     if scene.draws:
         yield from _stretched_picture(scene)
         if texture.is_see_through(scene):
