@@ -140,8 +140,8 @@ class Camera(Section):
 
     calibration: FilePath | None = key(
         None,
-        "in place of fov and distortion: calibration of OpenCV, ROS, COLMAP, SCARED or another program, a file relative "
-        "to the scene file",
+        "in place of fov and distortion: calibration of OpenCV, ROS, COLMAP, ZED or another program, relative to "
+        "the scene file",
         "the path of a file",
     )
     calibration_eye: Literal["left", "right"] = key(
