@@ -11,6 +11,9 @@ COUNT = 16
 def _read(file: CameraFile) -> Trajectory | None:
     """Read the matrices; None for another format, without sixteen numbers in the first line."""
     lines = [(n, line) for n, line in file.lines if line[0] != "#"]
+    if [len(line.split()) for _, line in lines[:4]] == [4] * 4 and parse_numbers(lines[3][1].split()) == [0, 0, 0, 1]:
+        fault = "a 4 x 4 matrix in four lines; write its first twelve numbers in one, from the camera to the world"
+        raise file.fault(fault, lines[0][0])
     rows = [parse_numbers(line.replace(",", " ").split()) for _, line in lines[:1]]
     if not rows or rows[0] is None or len(rows[0]) != COUNT:
         return None

@@ -76,6 +76,11 @@ class CameraFile:
         """Return an error, for the caller to raise, with the number of the line, from 1, where it is known."""
         return CameraFileError(f"{self.path}{'' if line is None else f':{line}'}: {fault}")
 
+    def entries(self, items: Iterable[tuple[Any, Any, int | None]]) -> Entries:
+        """Return the entries of keys, values and lines of this file; a CameraFileError for a repeated key."""
+        entries: Entries = self._parsed(lambda _: build_entries(items))
+        return entries
+
     @cached_property
     def lines(self) -> list[tuple[int, str]]:
         """Lines that are not empty, stripped, with their numbers from 1."""

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 from taichi_msm.camera_files.calibration import Calibration, CalibrationReader
-from taichi_msm.camera_files.camera_file import CameraFile, build_entries
+from taichi_msm.camera_files.camera_file import CameraFile
 from taichi_msm.camera_files.key_lookup import Keys
 from taichi_msm.camera_files.opencv import build_keys, read_camera
 
@@ -43,7 +43,7 @@ def _camera(file: CameraFile, calibration: Element, kind: str, camera: str) -> K
     if resolution is not None:
         values = [(name, value, None) for name, value, _ in values if name != "resolution"]
         values += [(name, resolution.get(name, ""), None) for name in ("width", "height")]
-    return Keys(file, build_entries([*values, ("type", kind, None)]), camera=camera)
+    return Keys(file, file.entries([*values, ("type", kind, None)]), camera=camera)
 
 
 def _read(keys: Keys) -> Calibration:

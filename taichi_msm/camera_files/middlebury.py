@@ -6,7 +6,7 @@ import math
 from collections.abc import Sequence
 
 from taichi_msm.camera_files.calibration import CalibrationReader, StereoPose
-from taichi_msm.camera_files.camera_file import CameraFile, build_entries
+from taichi_msm.camera_files.camera_file import CameraFile
 from taichi_msm.camera_files.key_lookup import Keys
 from taichi_msm.camera_files.opencv import NO_DISTORTION, read_camera
 
@@ -20,7 +20,7 @@ def _cameras(file: CameraFile) -> Sequence[Keys]:
     if not file.lines or not file.lines[0][1].replace(" ", "").startswith("cam0=["):
         return []
     pairs = [(n, *(word.strip() for word in line.partition("=")[::2])) for n, line in file.lines]
-    data = build_entries((name, value.strip("[]").replace(";", " "), n) for n, name, value in pairs)
+    data = file.entries((name, value.strip("[]").replace(";", " "), n) for n, name, value in pairs)
     keys = Keys(file, data)
     left, right = (keys.require(name, 9, name) for name in CAMERAS)
     offset, distance = keys.number("doffs"), right[2] - left[2]
@@ -29,7 +29,7 @@ def _cameras(file: CameraFile) -> Sequence[Keys]:
         raise keys.fault(f"{fault}; keep the right one", "doffs")
     shared = [(name, data[name], data.lines[name]) for name in ("width", "height", "baseline") if name in data]
     none = ("distortion_model", NO_DISTORTION, None)
-    return [Keys(file, build_entries([("K", data[name], data.lines[name]), none, *shared])) for name in CAMERAS]
+    return [Keys(file, file.entries([("K", data[name], data.lines[name]), none, *shared])) for name in CAMERAS]
 
 
 def _pose(keys: Keys) -> StereoPose:

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from typing import Any
 
 from taichi_msm.camera_files.calibration import Calibration, CalibrationReader
-from taichi_msm.camera_files.camera_file import CameraFile, Entries
+from taichi_msm.camera_files.camera_file import CameraFile, Entries, listed
 from taichi_msm.camera_files.key_lookup import Keys, flat
 from taichi_msm.camera_files.opencv import NO_DISTORTION, build_keys, read_camera
 from taichi_msm.camera_files.trajectory import (
@@ -56,7 +56,7 @@ def _read(keys: Keys) -> Calibration:
     """Read the intrinsics, shifted by half a pixel: the first pixel centre is (0.5, 0.5)."""
     names = [name for name in FOCAL if name in keys.data]
     if not names:
-        raise keys.file.fault(f"has no {' or '.join(FOCAL)}; found {keys}; add one of them")
+        raise keys.file.fault(f"has no {' or '.join(FOCAL)}; found {listed(keys.file.data)}; add one of them")
     size = (keys.number("w"), keys.number("h")) if {"w", "h"} & keys.data.keys() else None
     pictures = size or keys.file.picture_size
     if pictures is None:

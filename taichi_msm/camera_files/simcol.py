@@ -11,20 +11,27 @@ POSITIONS, ROTATIONS = "SavedPosition", "SavedRotationQuaternion"
 MAX_BYTES = 2**27
 
 
+def simcol_files(path: str) -> list[str]:
+    """Return the paths of positions and rotations of a sequence, of which one is `path`; [] for another format."""
+    name = Path(path).name
+    if not name.startswith((POSITIONS, ROTATIONS)):
+        return []
+    names = (name.replace(ROTATIONS, kind).replace(POSITIONS, kind) for kind in (POSITIONS, ROTATIONS))
+    return [str(Path(path).with_name(each)) for each in names]
+
+
 def _read(file: CameraFile) -> Trajectory | None:
     """Read positions `x y z` and, from the companion file, quaternions `x y z w`; None for another format.
 
     Unity's axes are x right, y up, z forward. With y turned over in the world and in the camera they are OpenCV's:
     positions (x, -y, z), quaternions (-x, y, -z, w).
     """
-    name = Path(file.path).name
-    if not name.startswith((POSITIONS, ROTATIONS)):
+    if not (paths := simcol_files(file.path)):
         return None
-    names = [name.replace(ROTATIONS, kind).replace(POSITIONS, kind) for kind in (POSITIONS, ROTATIONS)]
-    files = [CameraFile(str(Path(file.path).with_name(each)), MAX_BYTES) for each in names]
+    files = [CameraFile(path, MAX_BYTES) for path in paths]
     positions, rotations = (_table(each, count) for each, count in zip(files, (3, 4), strict=True))
     if len(positions) != len(rotations):
-        counts = f"{len(positions)} positions and {len(rotations)} rotations, of {names[1]}"
+        counts = f"{len(positions)} positions and {len(rotations)} rotations, of {paths[1]}"
         raise file.fault(f"{counts}; name files of one sequence")
     rows: list[Row] = []
     for index, ((n, (x, y, z)), (_, (qx, qy, qz, qw))) in enumerate(zip(positions, rotations, strict=True)):

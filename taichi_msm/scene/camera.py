@@ -399,8 +399,9 @@ class Camera(Section):
         unit = self.calibration_unit if self.beside else "m"
         try:
             calibration = read_calibration(self.calibration, self.calibration_eye, unit, self.camera, size)
-            if self.beside and calibration.right is None and reference is not None and reference.calibration:
-                pair_pose = read_pair_pose(reference.calibration, self.calibration, unit)
+            has_pose = self.beside is None or self.rotation is not None or calibration.right is not None
+            if not has_pose and reference is not None and reference.calibration:
+                pair_pose = read_pair_pose(reference.calibration, self.calibration, self.calibration_unit)
                 calibration = calibration._replace(right=pair_pose)
         except CameraFileError as error:
             raise scene_fault(str(error), "calibration") from None

@@ -391,6 +391,20 @@ def ros_pair(shift: tuple[float, float, float]) -> tuple[str, str, NDArray[np.fl
     return ros(matrix, left, left_projection), ros(matrix, right, right_projection), rotation
 
 
+def test_pair_of_files_with_a_rotation(small: Path) -> None:
+    """The keys of the camera count before the files."""
+    write("cam0.yaml", EUROC)
+    write("cam1.yaml", EUROC_RIGHT)
+    pose = {"rotation": np.eye(3).tolist(), "translation": [-0.01, 0, 0]}
+    cameras = {
+        "left": {"calibration": "cam0.yaml", **EYE},
+        "right": {"beside": "left", "calibration": "cam1.yaml", **pose},
+    }
+    right = load_scene("small.yaml", {"render.cameras": cameras}).render.all_cameras["right"]
+    assert isinstance(right, Camera)
+    assert right.translation == (-0.01, 0, 0)
+
+
 def test_pair_of_ros(small: Path) -> None:
     """The rectified matrices P and R determine R and T of stereoCalibrate."""
     shift = (-0.0054, 0.0003, -0.0002)
@@ -544,6 +558,8 @@ REFUSED: dict[str, tuple[str | bytes, str, dict[str, Any]]] = {
     ),
     "Metashape, k4": (METASHAPE.replace("<b1>1.5</b1>", "<k4>0.1</k4>"), "cameras.xml", {}),
     "Metashape, fisheye": (METASHAPE.replace('type="frame"><res', 'type="fisheye"><res'), "cameras.xml", {}),
+    "Metashape, key twice": (METASHAPE.replace("<b1>", "<k1>0</k1><b1>"), "cameras.xml", {}),
+    "Middlebury, key twice": (MIDDLEBURY + "doffs=1\n", "calib.txt", {}),
     "Middlebury, doffs": (MIDDLEBURY.replace("10.25", "0"), "calib.txt", {}),
     "DSO, FOV": ("0.5 0.6 0.49 0.5 0.9\n40 30\ncrop\n40 30\n", "camera.txt", {}),
     "DSO, other model": ("Omni 60 61 19.5 14.5 0 1 2\n40 30\nnone\n40 30\n", "camera.txt", {}),
