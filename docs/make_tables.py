@@ -72,9 +72,10 @@ def model_keys(model: type[Section], *titles: str) -> str:
 
 def readers(table: Sequence[CalibrationReader] | Sequence[TrajectoryReader]) -> str:
     """Return the table of readers of camera files."""
-    examples = (", ".join(f"`{example}`" for example in reader.examples) for reader in table)
-    rows = zip(table, examples, strict=True)
-    lines = [f"| {reader.name} | {reader.recognised_by} | {keys} |" for reader, keys in rows]
+    lines = [
+        f"| {reader.name} | {reader.recognised_by} | {', '.join(f'`{example}`' for example in reader.examples)} |"
+        for reader in table
+    ]
     return "| program | file | keys of the camera |\n|---|---|---|\n" + "\n".join(lines) + "\n"
 
 

@@ -11,7 +11,7 @@ from taichi_msm.camera_files.camera_file import CameraFile
 from taichi_msm.camera_files.colmap import MODELS, Picture, build_camera, build_trajectory
 from taichi_msm.camera_files.key_lookup import Keys
 from taichi_msm.camera_files.opencv import read_camera
-from taichi_msm.camera_files.trajectory import Trajectory, TrajectoryReader
+from taichi_msm.camera_files.trajectory import MAX_NUMBER, Trajectory, TrajectoryReader
 
 # Models by their numbers in binary files.
 MODEL_NUMBERS = {
@@ -87,6 +87,8 @@ def _read_images(file: CameraFile) -> Trajectory | None:
     records, pictures = _Records(file, "images.bin"), []
     for _ in range(min(*records.values("Q"), len(file.content))):
         _, *pose, camera = records.values("I7dI")
+        if not all(abs(number) <= MAX_NUMBER for number in pose):
+            records.fail()
         pictures.append(Picture(records.name(), None, pose, str(camera)))
         (points,) = records.values("Q")
         records.skip(24 * points)  # x, y and the number of the point

@@ -21,12 +21,13 @@ MODELS = {
 # Without a name, the number of coefficients determines the model.
 UNNAMED = {1: "Pinhole", 4: "RadTan"}
 RECTIFICATION = ("crop", "full", "none")
+SIZE = re.compile("[0-9]{1,9} [0-9]{1,9}")
 
 
 def _cameras(file: CameraFile) -> Sequence[Keys]:
     """Return the camera of the original pictures under OpenCV's keys; an empty list for another format."""
     rows = [(n, line.split()) for n, line in file.lines[:4]]
-    if len(rows) < 3 or len(rows[1][1]) != 2 or not all(word.isdecimal() for word in rows[1][1]):
+    if len(rows) < 3 or not SIZE.fullmatch(" ".join(rows[1][1])):
         return []
     numbers = parse_numbers(rows[2][1]) or []
     if rows[2][1][0] not in RECTIFICATION and len(numbers) != 5:

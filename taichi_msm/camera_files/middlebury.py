@@ -19,8 +19,8 @@ def _cameras(file: CameraFile) -> Sequence[Keys]:
     """Return both cameras under OpenCV's keys; an empty list for another format."""
     if not file.lines or not file.lines[0][1].replace(" ", "").startswith("cam0=["):
         return []
-    pairs = [(n, *(word.strip() for word in line.partition("=")[::2])) for n, line in file.lines]
-    data = file.entries((name, value.strip("[]").replace(";", " "), n) for n, name, value in pairs)
+    pairs = [(n, line.partition("=")) for n, line in file.lines]
+    data = file.entries((name.strip(), value.strip(" []").replace(";", " "), n) for n, (name, _, value) in pairs)
     keys = Keys(file, data)
     left, right = (keys.require(name, 9, name) for name in CAMERAS)
     offset, distance = keys.number("doffs"), right[2] - left[2]

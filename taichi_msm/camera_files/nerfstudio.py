@@ -48,8 +48,8 @@ def _frames(file: CameraFile) -> list[Entries]:
     if file.text.lstrip()[:1] != "{":
         return []
     frames = file.data.get("frames")
-    is_known = isinstance(frames, list) and all(isinstance(frame, Entries) for frame in frames)
-    return frames if is_known and all("transform_matrix" in frame for frame in frames) else []
+    entries = [frame for frame in (frames if isinstance(frames, list) else ()) if isinstance(frame, Entries)]
+    return entries if frames and all("transform_matrix" in frame for frame in entries) else []
 
 
 def _read(keys: Keys) -> Calibration:

@@ -502,14 +502,13 @@ def test_lines_of_the_page(small: Path, root: Path) -> None:
     for name, content in FILES.items():
         write(name, content)
     lines = page_lines(root)
-    assert {name for name, _ in lines} == {reader.name for reader in (*CALIBRATION_READERS, *TRAJECTORY_READERS)}
+    programs = {*(reader.name for reader in CALIBRATION_READERS), *(reader.name for reader in TRAJECTORY_READERS)}
+    assert {name for name, _ in lines} == programs
     for name, keys in lines:
         lens = {"eye": [0, 0, 0.4], "outside": "background"} if "calibration" in keys else {}
         overrides: dict[str, Any] = {"time.duration": 0.05, "time.frames_per_second": 20}
         if "calibration" in keys:
-            readers = [reader for reader in CALIBRATION_READERS if reader.name == name]
-            calibration = read_calibration(**{"path": keys["calibration"], "camera": keys.get("camera")})
-            assert readers
+            calibration = read_calibration(keys["calibration"], camera=keys.get("camera"))
             overrides["render.size"] = calibration.size or (40, 30)
         scene = load_scene("small.yaml", {"render.camera": keys | lens, **overrides})
         assert isinstance(scene.render.camera, Camera), name
@@ -540,6 +539,7 @@ REFUSED: dict[str, tuple[str | bytes, str, dict[str, Any]]] = {
     "truncated cameras.bin": (colmap_cameras(RADIAL)[:-8], "cameras.bin", {}),
     "other model in cameras.bin": (colmap_cameras((1, 77, 40, 30, ())), "cameras.bin", {}),
     "images.bin as calibration": (colmap_images(COLMAP), "images.bin", {}),
+    "DSO, size": (f"Pinhole 60 61 19.5 14.5 0\n{'4' * 5000} 30\nnone\n", "camera.txt", {}),
     "two in cameras.bin": (colmap_cameras(RADIAL, FISHEYE), "cameras.bin", {}),
     "no such camera": (colmap_cameras(RADIAL, FISHEYE), "cameras.bin", {"camera": 7}),
     "camera of a file without names": (stereo(), "stereo.yaml", {"camera": "left"}),
@@ -587,6 +587,12 @@ REFUSED_POSES: dict[str, tuple[str | bytes, str]] = {
     "4 x 4 matrices by rows": (ROWS, "poses.txt"),
     "4 x 4 matrices by rows with commas": (ROWS.replace(" ", ","), "poses.txt"),
     "4 x 4 matrix in lines": ("1 0 0 0\n0 1 0 0\n0 0 1 0.4\n0 0 0 1\n", "poses.txt"),
+    "not a number in images.bin": (
+        colmap_images("5 0 -1 0 0 0 nan 0.4 1 00100.jp2"),
+        "images.bin",
+    ),
+    "truncated images.bin": (colmap_images(COLMAP)[:-1], "images.bin"),
+    "name in images.bin": (struct.pack("<QI7dI4s", 1, 1, *[0.0] * 7, 1, b"name"), "images.bin"),
     "JSON": (transforms(), "transforms.json"),
     "nerfstudio, pose": (json.dumps({"frames": [{"transform_matrix": [[1, 0], [0, 1]]}]}), "transforms.json"),
     "SCARED, pose": (json.dumps({"camera-pose": [1, 2]}), "frame_data000000.json"),
