@@ -183,7 +183,7 @@ def read_poses(path: str, keys: PoseKeys = PoseKeys()) -> CameraPath:  # noqa: B
         rows.append(row)
     note = ""
     if repeated:
-        note = f"{path}: times that are there twice, {listed(repeated)}: the first pose of each is taken"
+        note = f"{path}: repeated times, {listed(repeated)}; the first pose of each is taken"
     return CameraPath(tuple(rows), is_still, note)
 
 

@@ -212,8 +212,8 @@ ADJUSTED = """\
 <p1>-0.0013</p1><p2>0.0008</p2><b1>1.5</b1>"""
 SENSOR = """\
 <sensor id="0" label="camera" type="frame"><resolution width="400" height="300"/>
-<calibration type="frame" class="initial"><resolution width="400" height="300"/><f>9</f></calibration>
-<calibration type="frame" class="adjusted">{}</calibration></sensor>"""
+<calibration type="frame" class="adjusted">{}</calibration>
+<calibration type="frame" class="initial"><resolution width="400" height="300"/><f>999</f></calibration></sensor>"""
 DOCUMENT = '<?xml version="1.0" encoding="UTF-8"?>\n<document><chunk><sensors>{}</sensors></chunk></document>\n'
 METASHAPE = DOCUMENT.format(SENSOR.format(ADJUSTED))
 LENS = ADJUSTED.replace(
@@ -423,7 +423,7 @@ def test_c3vd_poses(small: Path) -> None:
     np.testing.assert_allclose(rows[:, 0], np.arange(3) / 30)
     np.testing.assert_allclose(rows[:, 1:4], [[0.0015, 0.0025, 0.09], [0.0025, 0.0025, 0.09], [0.0035, 0.0025, 0.09]])
     np.testing.assert_allclose(Rotation.from_quat(rows[:, 4:]).as_matrix(), [TURN] * 3, atol=1e-15)
-    # As told by the user.
+    # The key counts before the unit of the format.
     assert read_poses("pose.txt", PoseKeys(poses_rate=30, poses_unit="m")).rows[0][1] == 1.5
 
 
