@@ -74,8 +74,11 @@ def model_keys(model: type[Section], *titles: str) -> str:
 
 def readers(table: Sequence[CalibrationReader] | Sequence[TrajectoryReader]) -> str:
     """Return the table of readers of camera files."""
-    lines = [f"| {reader.name} | {reader.recognised_by} |" for reader in table]
-    return "| format | recognised by |\n|---|---|\n" + "\n".join(lines) + "\n"
+    lines = [
+        f"| {reader.name} | {reader.recognised_by} | {', '.join(f'`{example}`' for example in reader.examples)} |"
+        for reader in table
+    ]
+    return "| program | file | keys of the camera |\n|---|---|---|\n" + "\n".join(lines) + "\n"
 
 
 # Functions that make the tables, by page and name.

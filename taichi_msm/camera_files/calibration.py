@@ -10,7 +10,7 @@ from taichi_msm.camera_files.key_lookup import Keys
 
 
 class StereoPose(NamedTuple):
-    """Pose of the right camera of a stereo pair: X_right = rotation X_left + translation."""
+    """Pose of a camera of a stereo pair: X = rotation X_left + translation, or relative to other axes."""
 
     rotation: tuple[tuple[float, ...], ...]  # rows of the matrix
     translation: tuple[float, ...]  # vector [m]
@@ -24,7 +24,8 @@ class Calibration(NamedTuple):
     size: tuple[int, int] | None  # width and height of the pictures [px]; None if the file does not contain them
     model: str  # name of the lens model, one of `taichi_msm.lenses.MODELS`
     coefficients: Mapping[str, float]  # coefficients of the lens by their names; missing ones are 0
-    right: StereoPose | None = None  # pose, of the right camera of a stereo pair only
+    right: StereoPose | None = None  # pose relative to the left camera, of the right camera of a stereo pair only
+    other_key: str = ""  # key that reads the right camera, in files with both cameras of a stereo pair
 
     def scaled(self, scale_x: float, scale_y: float) -> Calibration:
         """Return the calibration for pictures resized edge to edge, by factors of their width and height."""
@@ -60,8 +61,11 @@ class CalibrationReader(NamedTuple):
 
     name: str  # name of the format, for users
     recognised_by: str  # content by which a file is recognised, for users
+    examples: tuple[str, ...]  # keys of a camera that read such files, for users
     cameras: Callable[[CameraFile], Sequence[Keys]]  # keys of each camera, the left one first; empty for another format
     read: Callable[[Keys], Calibration]
     # Function that returns the pose of the right camera from its keys, in the unit of the file.
     pose: Callable[[Keys], StereoPose | None] = lambda keys: None
+    # Function that returns the pose relative to axes that both files of a pair share, in the unit of the file.
+    rig_pose: Callable[[Keys], StereoPose | None] = lambda keys: None
     unit: float | None = 1.0  # unit of lengths in the file [m]; None where the format does not define it

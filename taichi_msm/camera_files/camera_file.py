@@ -4,16 +4,19 @@ from __future__ import annotations
 
 import json
 import re
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from functools import cached_property
 from itertools import islice
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import yaml
 
 from taichi_msm.errors import truncate
 from taichi_msm.images import actual_path
 from taichi_msm.system.files import read_regular
+
+if TYPE_CHECKING:
+    from xml.etree.ElementTree import Element
 
 # Units of lengths [m].
 LENGTH_UNITS = {"m": 1.0, "mm": 1e-3}
@@ -51,15 +54,32 @@ class _ContentError(Exception):
 
 
 class CameraFile:
-    """Text file with a calibration or a trajectory of a camera; a CameraFileError if it cannot be read."""
+    """File with a calibration or a trajectory of a camera; a CameraFileError if it cannot be read.
 
-    def __init__(self, path: str, max_bytes: int) -> None:
+    `picture_size` is the size of the scene's pictures [px], for files that contain only their field of view.
+    """
+
+    def __init__(self, path: str, max_bytes: int, picture_size: tuple[int, int] | None = None) -> None:
         self.path = path
-        self.text = _read(path, max_bytes)
+        self.picture_size = picture_size
+        self.content = _read(path, max_bytes)
+
+    @cached_property
+    def text(self) -> str:
+        """Content of a text file; a CameraFileError for another one."""
+        try:
+            return self.content.decode("utf-8-sig")
+        except UnicodeDecodeError:
+            raise self.fault("not UTF-8; name a text file") from None
 
     def fault(self, fault: str, line: int | None = None) -> CameraFileError:
         """Return an error, for the caller to raise, with the number of the line, from 1, where it is known."""
         return CameraFileError(f"{self.path}{'' if line is None else f':{line}'}: {fault}")
+
+    def entries(self, items: Iterable[tuple[Any, Any, int | None]]) -> Entries:
+        """Return the entries of keys, values and lines of this file; a CameraFileError for a repeated key."""
+        entries: Entries = self._parsed(lambda _: build_entries(items))
+        return entries
 
     @cached_property
     def lines(self) -> list[tuple[int, str]]:
@@ -67,20 +87,28 @@ class CameraFile:
         return [(n, line) for n, raw in enumerate(self.text.splitlines(), 1) if (line := raw.strip())]
 
     @cached_property
+    def xml(self) -> Element | None:
+        """Root of an XML file; None for another format."""
+        return self._parsed(_xml_root) if self.text.lstrip()[:1] == "<" else None
+
+    @cached_property
     def data(self) -> Entries:
         """Keys and values of YAML, JSON, XML or an ini file; a CameraFileError for another format."""
+        data = self._parsed(_parse)
+        if not isinstance(data, Entries):
+            content = "a list" if isinstance(data, list) else "no keys"
+            raise self.fault(f"contains {content}; expected the keys camera_matrix and distortion_coefficients")
+        return data
+
+    def _parsed(self, parse: Callable[[str], Any]) -> Any:
         try:
-            data = _parse(self.text)
+            return parse(self.text)
         except _ContentError as error:
             raise self.fault(str(error), error.line) from None
         except _PARSER_ERRORS as error:
             mark = getattr(error, "problem_mark", None)
             line = mark.line + 1 if mark else getattr(error, "lineno", None)
             raise self.fault("neither YAML, XML, JSON nor ini; name a calibration file", line) from None
-        if not isinstance(data, Entries):
-            content = "a list" if isinstance(data, list) else "no keys"
-            raise self.fault(f"contains {content}; expected the keys camera_matrix and distortion_coefficients")
-        return data
 
 
 def listed(names: Iterable[Any]) -> str:
@@ -90,11 +118,9 @@ def listed(names: Iterable[Any]) -> str:
     return ", ".join(truncate(str(name)) for name in names[:shown]) + more
 
 
-def _read(name: str, max_bytes: int) -> str:
+def _read(name: str, max_bytes: int) -> bytes:
     try:
-        return read_regular(actual_path(name), max_bytes).decode("utf-8-sig")
-    except UnicodeDecodeError:
-        raise CameraFileError(f"{name}: not UTF-8; name a text file") from None
+        return read_regular(actual_path(name), max_bytes)
     except (OSError, ValueError) as error:
         reason = error.strerror if isinstance(error, OSError) and error.strerror else "not a path"
         raise CameraFileError(f"{name}: {reason.lower()}; name a calibration or a trajectory") from None
@@ -197,8 +223,7 @@ def _yaml(text: str) -> Any:
         raise
 
 
-def _xml(text: str) -> Entries:
-    """Parse OpenCV's XML, in which matrices have `data` and numbers are text."""
+def _xml_root(text: str) -> Element:
     from xml.etree import ElementTree
     from xml.parsers.expat.errors import XML_ERROR_NO_ELEMENTS, XML_ERROR_UNCLOSED_TOKEN, messages
 
@@ -206,14 +231,18 @@ def _xml(text: str) -> Entries:
     if "<!" in text.replace("<!--", ""):
         raise ValueError
     try:
-        root = ElementTree.fromstring(text)
+        return ElementTree.fromstring(text)
     except ElementTree.ParseError as error:
         if messages[error.code] in (XML_ERROR_NO_ELEMENTS, XML_ERROR_UNCLOSED_TOKEN):
             raise _truncated(text, "XML") from None
         fault = f"invalid XML from column {error.position[1] + 1} on; correct it, or export the calibration again"
         raise _ContentError(fault, error.position[0]) from None
+
+
+def _xml(text: str) -> Entries:
+    """Parse OpenCV's XML, in which matrices have `data` and numbers are text."""
     items: list[tuple[str, Any, None]] = []
-    for element in root:
+    for element in _xml_root(text):
         data = element.find("data")
         words = (element.text or "") if data is None else (data.text or "")
         items.append((element.tag, words.strip() if data is None else {"data": words.split()}, None))

@@ -35,6 +35,7 @@ def _read(keys: Keys) -> Calibration:
 CAMERA_JSON = CalibrationReader(
     "camera.json",
     "a run's camera.json of a pinhole: `projection`, `calibration`, `model`, `distortion`",
+    ("calibration: camera.json",),
     _cameras,
     _read,
 )

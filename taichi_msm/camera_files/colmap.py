@@ -4,22 +4,25 @@ from __future__ import annotations
 
 import re
 from collections.abc import Sequence
+from typing import Any, NamedTuple
 
 from taichi_msm.camera_files.calibration import CalibrationReader
 from taichi_msm.camera_files.camera_file import CameraFile, Entries, listed
 from taichi_msm.camera_files.key_lookup import Keys
-from taichi_msm.camera_files.opencv import read_camera
-from taichi_msm.camera_files.trajectory import Trajectory, TrajectoryReader, parse_numbers, pose_fault
+from taichi_msm.camera_files.opencv import build_keys, read_camera
+from taichi_msm.camera_files.trajectory import (
+    Row,
+    Trajectory,
+    TrajectoryReader,
+    parse_numbers,
+    picture_numbers,
+    pose_fault,
+)
 
 # A line of cameras.txt: id, model, width, height, parameters.
 CAMERA = re.compile(r"(\d+)\s+([A-Z_]+)\s+(\d+)\s+(\d+)((?:\s+[-+.\deE]+)+)")
 
 POINT_ID = re.compile(r"-1|\d+")
-
-# Numbers in the names of images: a time, and the last number, which is matched in the reversed name. Longer numbers are
-# neither times nor counts.
-TIME = re.compile(r"(?:.*\D)?(\d{1,30}\.\d{1,30})")
-REVERSED_END = re.compile(r"\D*(\d{1,30})")
 
 # Models: the number of focal lengths, the lens model, and the number of its coefficients.
 MODELS = {
@@ -35,64 +38,76 @@ MODELS = {
 }
 
 
+class Picture(NamedTuple):
+    """Picture of a model."""
+
+    name: str
+    line: int | None  # number of its line; None in binary files
+    pose: Sequence[float]  # quaternion w, x, y, z and translation, from the world to the camera
+    camera: str  # its number
+
+
 def _cameras(file: CameraFile) -> Sequence[Keys]:
-    """Return the camera under OpenCV's keys, shifted by half a pixel: COLMAP's first pixel centre is (0.5, 0.5)."""
-    matches: list[tuple[int, re.Match[str]]] = []
-    for n, line in file.lines:
-        if match := CAMERA.fullmatch(line):
-            matches.append((n, match))
-            if match.groups()[1:] != matches[0][1].groups()[1:]:
-                names = listed(match[1] for _, match in matches)
-                raise file.fault(f"has several cameras, {names}; keep the line of one", n)
-    return [_camera(file, n, *match.groups()[1:]) for n, match in matches[:1]]
+    """Return the cameras; an empty list for another format."""
+    matches = [(n, match) for n, line in file.lines if (match := CAMERA.fullmatch(line))]
+    cameras: list[Keys] = []
+    for n, match in matches:
+        number, name, width, height, words = match.groups()
+        parameters = Keys(file, Entries({"PARAMS": words}, {"PARAMS": n})).numbers("params") or ()
+        cameras.append(build_camera(file, number, name, (width, height), parameters, n))
+    return cameras
 
 
-def _camera(file: CameraFile, line: int, name: str, width: str, height: str, parameters: str) -> Keys:
+def build_camera(
+    file: CameraFile,
+    number: str,
+    name: str,
+    size: Sequence[Any],
+    parameters: Sequence[float],
+    line: int | None = None,
+) -> Keys:
+    """Return a camera under OpenCV's keys, shifted by half a pixel: COLMAP's first pixel centre is (0.5, 0.5)."""
     if name not in MODELS:
         raise file.fault(f"{name}: not a supported model; expected one of: {', '.join(MODELS)}", line)
     focal_count, model, coefficient_count = MODELS[name]
-    keys = Keys(file, Entries({"PARAMS": parameters}, {"PARAMS": line}))
-    numbers = keys.require("params", focal_count + 2 + coefficient_count, name)
-    fx, fy, (cx, cy) = numbers[0], numbers[focal_count - 1], numbers[focal_count : focal_count + 2]
-    values = [*numbers[focal_count + 2 :], *[0.0] * 4][: max(4, coefficient_count)]
-    matrix = [fx, 0, cx - 0.5, 0, fy, cy - 0.5, 0, 0, 1]
-    data = {"K": matrix, "D": values, "model": model, "size": [width, height]}
-    return Keys(file, Entries(data, dict.fromkeys(data, line)))
+    if len(parameters) != (count := focal_count + 2 + coefficient_count):
+        raise file.fault(f"{name}: {len(parameters)} numbers in place of {count}; write {count} numbers", line)
+    focal = parameters[0], parameters[focal_count - 1]
+    cx, cy, *coefficients = parameters[focal_count:]
+    padded = [*coefficients, *[0.0] * 4][: max(4, coefficient_count)]
+    return build_keys(file, focal, (cx - 0.5, cy - 0.5), padded, model, size, line, number)
 
 
 def _read_images(file: CameraFile) -> Trajectory | None:
-    """Read the poses, ordered by times or final numbers in the image names, else by name; None for another format."""
+    """Read the poses, in the order of `build_trajectory`; None for another format."""
     lines = [(n, line) for n, line in file.lines if line[0] != "#"]
     if not lines or _image(lines[0][1]) is None:
         return None
-    from scipy.spatial.transform import Rotation
-
-    images, follows_image = [], False
+    pictures, follows_picture = [], False
     for n, line in lines:
         if (image := _image(line)) is not None:
             name, pose, camera = image
-            images.append((name, n, pose, camera))
-        elif not (follows_image and _has_points(line.split())):
+            pictures.append(Picture(name, n, pose, camera))
+        elif not (follows_picture and _has_points(line.split())):
             fault = "neither an image, IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME, nor points"
             raise file.fault(f"{fault}; export the model again", n)
-        follows_image = image is not None
-    if len(cameras := {camera for *_, camera in images}) > 1:
+        follows_picture = image is not None
+    return build_trajectory(file, pictures)
+
+
+def build_trajectory(file: CameraFile, pictures: Sequence[Picture]) -> Trajectory:
+    """Invert the poses of pictures, ordered by `picture_numbers`."""
+    from scipy.spatial.transform import Rotation
+
+    if len(cameras := {picture.camera for picture in pictures}) > 1:
         raise file.fault(f"has images of cameras {listed(sorted(cameras))}; keep those of one")
-    stems = [name.rpartition(".")[0] or name for name, *_ in images]
-    # Times as names, such as 1305031102.975304.png.
-    times = [float(match[1]) for stem in stems if (match := TIME.fullmatch(stem))]
-    has_times = len({*times}) == len(images)
-    ends = [REVERSED_END.match(stem[::-1]) for stem in stems]
-    numbers: list[float] = times if has_times else [int(end[1][::-1]) for end in ends if end]
-    if len({*numbers}) < len(images):
-        images.sort()
-        numbers = list(range(len(images)))
-    poses: list[tuple[int, list[float]]] = []
-    for number, (_, n, (w, x, y, z, *translation), _) in sorted(zip(numbers, images, strict=True)):
+    numbers, has_times = picture_numbers([picture.name for picture in pictures])
+    poses: list[Row] = []
+    for number, (_, line, (w, x, y, z, *translation), _) in sorted(zip(numbers, pictures, strict=True)):
         if fault := pose_fault((0, 0, 0, 0, x, y, z, w), None):
-            raise file.fault(fault, n)
+            raise file.fault(fault, line)
         inverse = Rotation.from_quat((x, y, z, w)).inv()
-        poses.append((n, [number, *(-inverse.apply(translation)).tolist(), *inverse.as_quat().tolist()]))
+        poses.append((line, [number, *(-inverse.apply(translation)).tolist(), *inverse.as_quat().tolist()]))
     return Trajectory(poses, has_times)
 
 
@@ -114,8 +129,15 @@ def _has_points(words: Sequence[str]) -> bool:
 
 
 COLMAP_CAMERAS = CalibrationReader(
-    "COLMAP", "cameras.txt: a line `CAMERA_ID MODEL WIDTH HEIGHT PARAMS`", _cameras, read_camera
+    "COLMAP",
+    "cameras.txt: lines `CAMERA_ID MODEL WIDTH HEIGHT PARAMS`; of several, one is selected by `camera`",
+    ("calibration: cameras.txt", "calibration: cameras.txt, camera: 1"),
+    _cameras,
+    read_camera,
 )
 COLMAP_IMAGES = TrajectoryReader(
-    "COLMAP", "images.txt: lines `IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME`; needs `poses_rate`", _read_images
+    "COLMAP",
+    "images.txt: lines `IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME`; needs `poses_rate`",
+    ("poses: images.txt, poses_rate: 25",),
+    _read_images,
 )

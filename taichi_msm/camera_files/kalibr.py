@@ -35,6 +35,17 @@ def _pose(keys: Keys) -> StereoPose | None:
     return StereoPose(tuple(tuple(rows[n : n + 3]) for n in (0, 4, 8)), tuple(rows[3:12:4]))
 
 
+def _rig_pose(keys: Keys) -> StereoPose | None:
+    """Invert T_BS of EuRoC, the matrix [R, t] from the camera to the body, shape (4, 4)."""
+    if "T_BS" not in keys.data:
+        return None
+    import numpy as np
+
+    matrix = np.array(keys.require("tbs", 16, "T_BS")).reshape(4, 4)[:3]
+    rotation = matrix[:, :3].T
+    return StereoPose(tuple(map(tuple, rotation.tolist())), tuple((-rotation @ matrix[:, 3]).tolist()))
+
+
 def _is_camera(section: Any) -> TypeGuard[Entries]:
     """Return whether a section has a model and a list of intrinsics; nine numbers are a matrix of another format."""
     has_model = isinstance(section, Entries) and "camera_model" in section
@@ -63,7 +74,9 @@ def _sort_key(name: object) -> tuple[int, str]:
 KALIBR = CalibrationReader(
     "Kalibr's camchain, EuRoC's sensor.yaml",
     "`camera_model`, `intrinsics: [fx, fy, cx, cy]`, in `cam0` and `cam1`, whose pose is `T_cn_cnm1`",
+    ("calibration: camchain.yaml", "calibration: sensor.yaml"),
     _cameras,
     read_camera,
     _pose,
+    _rig_pose,
 )

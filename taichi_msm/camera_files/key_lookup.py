@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from itertools import zip_longest
 from typing import Any
 
@@ -21,8 +21,11 @@ ROUNDING_TOLERANCE = 1e-6
 class Keys:
     """Keys of one camera in a calibration."""
 
-    def __init__(self, file: CameraFile, data: Entries, folded: Mapping[str, str] | None = None) -> None:
+    def __init__(
+        self, file: CameraFile, data: Entries, folded: Mapping[str, str] | None = None, camera: str = ""
+    ) -> None:
         self.file = file
+        self.camera = camera  # name of the camera, in files of which one camera is selected by its name
         self.data = data  # values by name in the file
         # Folded names without the mark of the camera (left, 1, ...), by default with it.
         self.folded = {name: fold(name) for name in data} if folded is None else folded
@@ -64,9 +67,15 @@ class Keys:
         if numbers is None:
             raise self.file.fault(f"has no {name}; found {self}; add it")
         if len(numbers) != count:
-            fault = f"{name}: {len(numbers)} numbers in place of {count}"
+            fault = f"{name}: {describe_count(numbers)} in place of {count}"
             raise self.fault(f"{fault}; found {self}; write {count} numbers", self.find(spelling))
         return numbers
+
+    def number(self, name: str, default: float | None = None) -> float:
+        """Return the number of a key; without the key the default, or a CameraFileError if there is none."""
+        if default is not None and not self.values(fold(name)):
+            return default
+        return self.require(fold(name), 1, name)[0]
 
     def unread(self, spelling: str) -> list[str]:
         """Return the names that match a spelling, were never looked up, and have a value other than 0."""
@@ -89,6 +98,11 @@ class Keys:
             fault = f"{len(numbers)} numbers for {rows} rows of {cols}; write {rows * cols} numbers"
             raise self.fault(f"{name}: {fault}", name)
         return numbers
+
+
+def describe_count(numbers: Sequence[float]) -> str:
+    """Describe the count of numbers, of which 16 are a matrix."""
+    return "16 numbers, a 4 x 4 matrix," if len(numbers) == 16 else f"{len(numbers)} numbers"
 
 
 def fold(name: object) -> str:

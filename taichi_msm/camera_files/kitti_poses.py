@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from taichi_msm.camera_files.camera_file import CameraFile
-from taichi_msm.camera_files.trajectory import NORM_TOLERANCE, Trajectory, TrajectoryReader, parse_numbers
+from taichi_msm.camera_files.trajectory import Trajectory, TrajectoryReader, build_rows, parse_numbers
 
 COUNT = 12
 
@@ -14,7 +14,6 @@ def _read(file: CameraFile) -> Trajectory | None:
     if not lines or len(lines[0][1].split()) != COUNT or parse_numbers(lines[0][1].split()) is None:
         return None
     import numpy as np
-    from scipy.spatial.transform import Rotation
 
     poses: list[list[float]] = []
     for n, line in lines:
@@ -23,14 +22,12 @@ def _read(file: CameraFile) -> Trajectory | None:
             raise file.fault("not twelve numbers, as in the first line; write twelve in each line", n)
         poses.append(numbers)
     matrices = np.array(poses).reshape(-1, 3, 4)
-    rotations = matrices[:, :, :3]
-    deviations = abs(rotations @ rotations.swapaxes(1, 2) - np.eye(3)).max(axis=(1, 2))
-    if (faults := (deviations > NORM_TOLERANCE) | (np.linalg.det(rotations) < 0)).any():
-        fault = "its first three columns are not a rotation; write an orthonormal matrix"
-        raise file.fault(fault, lines[int(faults.argmax())][0])
-    quaternions = Rotation.from_matrix(rotations).as_quat()
-    rows = np.column_stack([np.arange(len(poses)), matrices[:, :, 3], quaternions]).tolist()
-    return Trajectory([(n, row) for (n, _), row in zip(lines, rows, strict=True)], has_times=False)
+    return Trajectory(build_rows(file, [n for n, _ in lines], range(len(poses)), matrices), has_times=False)
 
 
-KITTI = TrajectoryReader("KITTI", "lines of twelve numbers, without a header; needs `poses_rate`", _read)
+KITTI = TrajectoryReader(
+    "KITTI",
+    "lines of twelve numbers, without a header; needs `poses_rate`",
+    ("poses: 00.txt, poses_rate: 10",),
+    _read,
+)

@@ -44,5 +44,9 @@ def _read(keys: Keys) -> Calibration:
 
 
 OCAMCALIB = CalibrationReader(
-    "OCamCalib", "calib_results.txt: `#polynomial coefficients for the DIRECT mapping function`", _cameras, _read
+    "OCamCalib",
+    "calib_results.txt: `#polynomial coefficients for the DIRECT mapping function`",
+    ("calibration: calib_results.txt",),
+    _cameras,
+    _read,
 )

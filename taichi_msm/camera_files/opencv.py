@@ -8,9 +8,10 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Sequence
+from typing import Any
 
 from taichi_msm.camera_files.calibration import Calibration, CalibrationReader, StereoPose, focal_fault
-from taichi_msm.camera_files.camera_file import Entries, listed
+from taichi_msm.camera_files.camera_file import CameraFile, Entries, listed
 from taichi_msm.camera_files.key_lookup import ROUNDING_TOLERANCE, Keys, flat, fold
 from taichi_msm.errors import truncate
 from taichi_msm.lenses import MODELS
@@ -72,16 +73,34 @@ FLAGS = {
 _REMEDY = "write camera_matrix: [fx, 0, cx, 0, fy, cy, 0, 0, 1], distortion_coefficients: [k1, k2, p1, p2]"
 
 
+def build_keys(
+    file: CameraFile,
+    focal: Sequence[float],
+    centre: Sequence[float],
+    coefficients: Sequence[float],
+    model: str,
+    size: Sequence[Any] | None,
+    line: int | None = None,
+    camera: str = "",
+) -> Keys:
+    """Return the keys of a camera: focal lengths and centre in OpenCV's pixels, coefficients in OpenCV's order."""
+    data: dict[str, Any] = {"K": [focal[0], 0, centre[0], 0, focal[1], centre[1], 0, 0, 1], "D": [*coefficients]}
+    data |= {"model": model} | ({} if size is None else {"size": [*size]})
+    return Keys(file, Entries(data, {} if line is None else dict.fromkeys(data, line)), camera=camera)
+
+
 def read_camera(keys: Keys) -> Calibration:
     """Read a calibration from the keys of a camera."""
-    file, matrix, values = keys.file, keys.numbers(MATRIX), keys.numbers(COEFFICIENTS)
-    if matrix is None:
+    file, numbers, values = keys.file, keys.numbers(MATRIX), keys.numbers(COEFFICIENTS)
+    if numbers is None:
         raise file.fault(f"has no known camera matrix; found {keys}; {_REMEDY}")
     name = keys.find(MATRIX)
+    matrix = numbers
     if matrix[12:] == [0, 0, 0, 1] and matrix[3:12:4] == [0, 0, 0]:  # 4 x 4, for homogeneous coordinates
         matrix = [*matrix[:3], *matrix[4:7], *matrix[8:11]]
+    label = f"{name}, a 4 x 4 matrix" if len(numbers) == 16 else name
     if len(matrix) != 9 or [matrix[n] for n in (1, 3, 6, 7, 8)] != [0, 0, 0, 0, 1] or min(matrix[::4]) <= 0:
-        raise keys.fault(f"{name}: is not [fx, 0, cx, 0, fy, cy, 0, 0, 1]; write the camera matrix like that", name)
+        raise keys.fault(f"{label}: is not [fx, 0, cx, 0, fy, cy, 0, 0, 1]; write the camera matrix like that", name)
     (fx, _, cx), (_, fy, cy) = matrix[:3], matrix[3:6]
     _require_agreement(keys, (fx, fy), (cx, cy))
     xi = keys.numbers("xi") or []
@@ -92,7 +111,7 @@ def read_camera(keys: Keys) -> Calibration:
         raise file.fault(f"{fault}; found {keys}; {remedy}")
     size = _size(keys)
     if size and (fault := focal_fault((fx, fy), size)):
-        raise keys.fault(f"{name}: {fault}", name)
+        raise keys.fault(f"{label}: {fault}", name)
     if names := keys.unread(UNSUPPORTED):
         fault = f"{listed(names)}: unknown, and may change the projection"
         raise keys.fault(f"{fault}; found {keys}; {_REMEDY}, or remove the keys that do not matter", names[0])
@@ -114,6 +133,23 @@ def read_pose(keys: Keys) -> StereoPose | None:
     rotation = shared.require(ROTATION, 9, "rotation R")
     rows = tuple(tuple(rotation[n : n + 3]) for n in (0, 3, 6))
     return StereoPose(rows, tuple(shared.require(TRANSLATION, 3, "translation T")))
+
+
+def read_rig_pose(keys: Keys) -> StereoPose | None:
+    """Read P and R of ROS: the pose relative to the rectified axes of the left camera; None if the file lacks them.
+
+    With P = K' [I, t] and the rectification R, X_camera = R^T (X_rectified + t).
+    """
+    projection, rectification = keys.numbers("p|projection(matrix)?"), keys.numbers("r|rectification(matrix)?")
+    if projection is None or rectification is None or len(projection) != 12 or len(rectification) != 9:
+        return None
+    import numpy as np
+
+    matrix, rotation = np.array(projection).reshape(3, 4), np.array(rectification).reshape(3, 3).T
+    if not (abs(np.linalg.det(matrix[:, :3])) > 0):
+        return None
+    translation = rotation @ np.linalg.solve(matrix[:, :3], matrix[:, 3])
+    return StereoPose(tuple(map(tuple, rotation.tolist())), tuple(translation.tolist()))
 
 
 def _require_agreement(keys: Keys, focal: Sequence[float], centre: Sequence[float]) -> None:
@@ -203,7 +239,9 @@ def _size(keys: Keys) -> tuple[int, int] | None:
 OPENCV = CalibrationReader(
     "OpenCV, ROS",
     "a matrix `camera_matrix`, `K`, `mtx`, ..., with `distortion_coefficients`, `D`, `dist`, ...",
+    ("calibration: camera.yaml",),
     lambda file: [Keys(file, file.data)],
     read_camera,
     read_pose,
+    read_rig_pose,
 )

@@ -30,9 +30,9 @@ SHARED = {"f", "alpha"}
 RECTIFICATION = {"p1": 12, "p2": 12, "roi": 4}
 
 
-def _cameras(file: CameraFile) -> Sequence[Keys]:
+def build_cameras(file: CameraFile, data: Entries) -> Sequence[Keys]:
     """Return the keys of each camera, with those without a mark; an empty list if a camera has no matrix."""
-    data = _flatten_sections(file.data)
+    data = _flatten_sections(data)
     for marks in MARKS:
         sides = [_strip_mark(data, mark) for mark in marks]
         matrices = [[key for key, name in side.items() if re.fullmatch(MATRIX, name)] for side in sides]
@@ -49,7 +49,7 @@ def _camera(file: CameraFile, data: Entries, names: dict[str, str]) -> Keys:
     return Keys(file, Entries({key: data[key] for key in names}, data.lines), names)
 
 
-def _pose(keys: Keys) -> StereoPose | None:
+def read_stereo_pose(keys: Keys) -> StereoPose | None:
     """Read R and T; unknown keys that may define another unit or pose are an error."""
     if names := keys.unread(r"units?|[rt]c?m+|rt|extrinsics?"):
         remedy = "write R (3 x 3) and T (3 numbers) in metres, or set calibration_unit: mm, and remove the unknown keys"
@@ -79,10 +79,11 @@ def _strip_mark(keys: Iterable[str], mark: str) -> dict[str, str]:
 
 
 STEREO = CalibrationReader(
-    "OpenCV stereo, SCARED, STIR",
+    "OpenCV stereo, STIR",
     "`K1`, `D1`, `K2`, `D2` (or `M1`, `cameraMatrix1`, `leftcameramat`, `K_l`, ...), with `R`, `T`",
-    _cameras,
+    ("calibration: stereo.yaml",),
+    lambda file: build_cameras(file, file.data),
     read_camera,
-    _pose,
+    read_stereo_pose,
     unit=None,
 )

@@ -47,5 +47,11 @@ def _camera(file: CameraFile, section: Entries, line: int | None) -> Keys:
 
 
 STEREOMIS = CalibrationReader(
-    "StereoMIS", "an ini file with `[StereoLeft]`, `[StereoRight]`", _cameras, read_camera, read_pose, unit=1e-3
+    "StereoMIS",
+    "an ini file with `[StereoLeft]`, `[StereoRight]`",
+    ("calibration: StereoCalibration.ini",),
+    _cameras,
+    read_camera,
+    read_pose,
+    unit=1e-3,
 )

@@ -48,6 +48,9 @@ TUM = _Columns(tuple(range(8)), 8)
 
 def _read(file: CameraFile) -> Trajectory:
     """Read the rows; without a header, the columns are TUM's."""
+    if file.text.lstrip()[:1] in ("{", "[", "<"):
+        fault = "JSON or XML without known poses; expected transforms.json of nerfstudio, frame_data of SCARED"
+        raise file.fault(f"{fault}, or a text with lines {' '.join(COLUMNS)}")
     rows: list[tuple[int, list[float]]] = []
     columns = None
     for n, line in file.lines:
@@ -144,5 +147,6 @@ def _row(
 TABLES = TrajectoryReader(
     "TUM, EuRoC, TUM-VI",
     "lines `t tx ty tz qx qy qz qw`, or a header with names of columns, such as `#timestamp [ns],...`",
+    ("poses: groundtruth.txt, poses_start: 0", "poses: data.csv, poses_start: 0"),
     _read,
 )

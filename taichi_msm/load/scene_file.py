@@ -259,7 +259,7 @@ class Draft:
             noun = "the picture" if key in PICTURE_KEYS else "it"
             message = f"{path} is not below the scene's folder; put {noun} there{remedy}"
             self.problems.append((self._origin(key), Problem(key, message)))
-            del section[key[-1]]
+            section[key[-1]] = ""  # Invalid, at the same key; without the key, others would be reported as missing.
         elif key[-1] in CAMERA_FILE_KEYS:
             # Validation would report only the first missing camera file.
             try:

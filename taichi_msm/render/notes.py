@@ -28,6 +28,9 @@ def drawing_warnings(scene: Scene) -> Iterator[str]:
         yield scene.sheet.unit_hint
     if scene.tissue and scene.tissue.unit_hint:
         yield scene.tissue.unit_hint
+    for name, camera in scene.render.all_cameras.items():
+        if isinstance(camera, Camera) and camera.note:
+            yield f"render.{f'cameras.{name}' if name else 'camera'}.poses: {camera.note}"
     if scene.draws:
         yield from _stretched_picture(scene)
         if texture.is_see_through(scene):

@@ -3,16 +3,26 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Collection, Iterable
+from collections.abc import Collection, Iterable, Sequence
 from typing import Annotated, Any, Literal
 
-from pydantic import Field, StrictBool, ValidationError, ValidationInfo, create_model, field_validator, model_validator
+from pydantic import (
+    Field,
+    PrivateAttr,
+    StrictBool,
+    StrictInt,
+    ValidationError,
+    ValidationInfo,
+    create_model,
+    field_validator,
+    model_validator,
+)
 from typing_extensions import Self
 
 from taichi_msm.camera_files.calibration import Calibration, focal_fault
 from taichi_msm.camera_files.camera_file import CameraFileError
 from taichi_msm.camera_files.key_lookup import ROUNDING_TOLERANCE
-from taichi_msm.camera_files.readers import PoseKeys, read_calibration, read_poses
+from taichi_msm.camera_files.readers import PoseKeys, read_calibration, read_pair_pose, read_poses
 from taichi_msm.camera_files.trajectory import pose_fault
 from taichi_msm.lenses import MODELS
 from taichi_msm.lenses.model import MAX_COEFFICIENT
@@ -130,12 +140,17 @@ class Camera(Section):
 
     calibration: FilePath | None = key(
         None,
-        "in place of fov and distortion: calibration of OpenCV, ROS, SCARED, STIR, StereoMIS, Kalibr or COLMAP, a file "
-        "relative to the scene file",
+        "in place of fov and distortion: calibration of OpenCV, ROS, COLMAP, ZED or another program, relative to "
+        "the scene file",
         "the path of a file",
     )
     calibration_eye: Literal["left", "right"] = key(
         "left", "camera of a stereo calibration that is read", "left or right"
+    )
+    camera: StrictInt | Annotated[str, Field(strict=True, min_length=1)] | None = key(
+        None,
+        "in a calibration of several cameras (ZED, COLMAP, Metashape), name of the one that is read",
+        "the name of a camera in the file, such as LEFT_CAM_HD",
     )
     calibration_unit: Literal["m", "mm"] | None = key(
         None, "unit of the translation T in a stereo calibration", "m or mm"
@@ -164,11 +179,11 @@ class Camera(Section):
     poses: FilePath | PoseRows | None = key(
         None,
         "in place of eye, target and up: trajectory, the transform from the camera to the world: a file of TUM, EuRoC, "
-        "KITTI or COLMAP, relative to the scene file, or rows [t, tx, ty, tz, qx, qy, qz, qw]",
+        "KITTI, COLMAP or another program, relative to the scene file, or rows [t, tx, ty, tz, qx, qy, qz, qw]",
         "the path of a file, or rows [[t, tx, ty, tz, qx, qy, qz, qw], ...]",
     )
     poses_unit: Literal["m", "mm"] | None = key(
-        None, "unit of positions in the file of poses; default: that of its header, else m", "m or mm"
+        None, "unit of positions in the file of poses; default: that of its header or format, else m", "m or mm"
     )
     poses_time: Literal["s", "ms", "us", "ns"] | None = key(
         None, "unit of times in the file of poses; default: that of its header, else s", "s, ms, us or ns"
@@ -180,7 +195,7 @@ class Camera(Section):
         "a number, in seconds",
     )
     poses_rate: Positive | None = key(
-        None, "poses per second of a file without times (KITTI, COLMAP)", "a number above 0"
+        None, "poses per second of a file without times, such as KITTI's and COLMAP's", "a number above 0"
     )
     beside: Annotated[str, Field(strict=True, min_length=1)] | None = key(
         None,
@@ -227,6 +242,14 @@ class Camera(Section):
         "a number from 0.001 to below 180, in degrees",
     )
 
+    # Warning about the file of poses, set where it is read.
+    _note: str = PrivateAttr("")
+
+    @property
+    def note(self) -> str:
+        """Warning about the file of poses; empty without one."""
+        return self._note
+
     @property
     def has_own_lens(self) -> bool:
         """Whether the camera has its own intrinsics, in place of those of its reference camera."""
@@ -272,7 +295,7 @@ class Camera(Section):
         for name in ("baseline", "rotation", "translation") if self.beside is None else ():
             if name in given:
                 raise scene_fault(f"requires beside, the name of another camera; add beside or remove {name}", name)
-        for name in ("scale", "calibration_eye", "calibration_unit") if self.calibration is None else ():
+        for name in ("scale", "calibration_eye", "camera", "calibration_unit") if self.calibration is None else ():
             if getattr(self, name) != type(self).model_fields[name].default:
                 raise scene_fault(f"requires calibration; remove {name}", name)
         for name in PoseKeys._fields if not isinstance(self.poses, str) else ():
@@ -280,6 +303,10 @@ class Camera(Section):
                 raise scene_fault(f"requires poses, the path of a file; remove {name}", name)
         if self.outside == "background" and self.distortion is None and self.calibration is None:
             raise scene_fault("requires distortion; remove outside", "outside")
+        if self.camera is not None and "calibration_eye" in given:
+            raise scene_fault(
+                "conflicts with camera, which selects the camera; remove calibration_eye", "calibration_eye"
+            )
         self._check_focal_length()
         exclusive = (("calibration", "intrinsics", "fov"), ("pose", "poses", "eye"), ("calibration", "distortion"))
         for names in exclusive:
@@ -341,13 +368,19 @@ class Camera(Section):
         if not isinstance(self.poses, str):
             return self
         try:
-            rows = read_poses(self.poses, PoseKeys(**{name: getattr(self, name) for name in PoseKeys._fields}))
+            rows, is_still, note = read_poses(
+                self.poses, PoseKeys(**{name: getattr(self, name) for name in PoseKeys._fields})
+            )
         except CameraFileError as error:
             raise scene_fault(str(error), "poses") from None
-        kept = {name: getattr(self, name) for name in self.model_fields_set - {*PoseKeys._fields}}
-        return self.model_validate(kept | {"poses": rows})
+        kept = {name: getattr(self, name) for name in self.model_fields_set - {"poses", *PoseKeys._fields}}
+        if is_still:
+            return self.model_validate({**kept, "pose": still_pose(rows[0])})
+        camera = self.model_validate(kept | {"poses": rows})
+        object.__setattr__(camera, "__pydantic_private__", {"_note": note})
+        return camera
 
-    def calibrated(self, size: tuple[int, int], *, is_image: bool = False) -> Self:
+    def calibrated(self, size: tuple[int, int], *, is_image: bool = False, reference: Camera | None = None) -> Self:
         """Return a copy with the intrinsics and the distortion of the calibration in place of its file.
 
         Without a file, return the camera itself.
@@ -355,6 +388,7 @@ class Camera(Section):
         Args:
             size: width and height of the pictures [px].
             is_image: whether they are those of the scene's image, not render.size.
+            reference: camera that `beside` names, with its files, if any.
         """
         if self.calibration is None:
             given = self.intrinsics
@@ -364,7 +398,11 @@ class Camera(Section):
         # The unit of lengths matters only to stereo pairs.
         unit = self.calibration_unit if self.beside else "m"
         try:
-            calibration = read_calibration(self.calibration, self.calibration_eye, unit)
+            calibration = read_calibration(self.calibration, self.calibration_eye, unit, self.camera, size)
+            has_pose = self.beside is None or self.rotation is not None or calibration.right is not None
+            if not has_pose and reference is not None and reference.calibration:
+                pair_pose = read_pair_pose(reference.calibration, self.calibration, self.calibration_unit)
+                calibration = calibration._replace(right=pair_pose)
         except CameraFileError as error:
             raise scene_fault(str(error), "calibration") from None
         if calibration.focal and not calibration.size and (fault := focal_fault(calibration.focal, size)):
@@ -386,20 +424,22 @@ class Camera(Section):
         calibration = calibration.scaled(scale_x, scale_y)
         intrinsics = dict(zip(("cx", "cy", "fx", "fy"), calibration.centre + (calibration.focal or ()), strict=False))
         update: dict[str, Any] = {"intrinsics": intrinsics, **self._stereo_pose(calibration)}
-        unused = {"calibration", "calibration_eye", "calibration_unit", "scale"}
+        unused = {"calibration", "calibration_eye", "camera", "calibration_unit", "scale"}
         if calibration.model != "pinhole" or any(calibration.coefficients.values()):
             update["distortion"] = {"model": calibration.model, **calibration.coefficients}
         else:
             unused |= {"outside"}
         kept = {name: getattr(self, name) for name in self.model_fields_set - unused}
         try:
-            return self.model_validate(kept | update)
+            camera = self.model_validate(kept | update)
         except ValidationError as error:
             details = error.errors()[0]
             value = f"{'.'.join(map(str, details['loc']))} = {details['input']:g} is out of range"
             if self.scale:
                 value += " for pictures of this size; calibrate at a size near it"
             raise scene_fault(f"{self.calibration}: {value}", "scale" if self.scale else "calibration") from None
+        object.__setattr__(camera, "__pydantic_private__", {"_note": self.note})
+        return camera
 
     def _stereo_pose(self, calibration: Calibration) -> dict[str, Any]:
         """Return the keys rotation and translation of a stereo calibration; empty for a camera without `beside`."""
@@ -410,11 +450,21 @@ class Camera(Section):
                 raise scene_fault(f"conflicts with R and T of {self.calibration}; remove one of them", "rotation")
             return calibration.right._asdict()
         if self.rotation is None:
-            remedy = "set calibration_eye: right for a stereo file, or add rotation and translation"
+            remedy = "add rotation and translation, R and T of stereoCalibrate"
+            if calibration.other_key:
+                remedy = f"set {calibration.other_key}, or add rotation and translation"
             if self.calibration_eye == "right":
                 remedy = "write R, 3 x 3, and T, 3 numbers, of stereoCalibrate, or add rotation and translation"
             raise scene_fault(f"{self.calibration}: has no R and T of this camera; {remedy}", "calibration")
         return {}
+
+
+def still_pose(row: Sequence[float]) -> dict[str, Any]:
+    """Return the keys of `Pose`, from the world to the camera, of a row of `poses`."""
+    from scipy.spatial.transform import Rotation
+
+    inverse = Rotation.from_quat(row[4:]).inv()
+    return {"rotation": inverse.as_matrix().tolist(), "translation": (-inverse.apply(row[1:4])).tolist()}
 
 
 def _given_before(info: ValidationInfo) -> set[str]:

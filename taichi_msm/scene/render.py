@@ -108,7 +108,7 @@ class Render(Section):
     def _read_files(cls, camera: AnyCamera, info: ValidationInfo) -> AnyCamera:
         if isinstance(camera, Camera) and camera.beside is not None:
             raise scene_fault("requires render.cameras, where the reference camera has a name; remove beside", "beside")
-        return _read_files(camera, info)
+        return _read_files(camera, info, {})
 
     @field_validator("cameras", mode="after")
     @classmethod
@@ -129,7 +129,7 @@ class Render(Section):
         loaded = {}
         for name, camera in cameras.items():
             try:
-                loaded[name] = _read_files(camera, info)
+                loaded[name] = _read_files(camera, info, cameras)
             except PydanticCustomError as error:
                 raise scene_fault(error.message(), name, *(error.context or {}).get("below", ())) from None
         return loaded
@@ -190,15 +190,17 @@ class Render(Section):
         return next((right for right, camera in cameras if isinstance(camera, Camera) and camera.beside == name), "")
 
 
-def _read_files(camera: AnyCamera, info: ValidationInfo) -> AnyCamera:
-    """Return the camera with its calibration and trajectory files read."""
+def _read_files(camera: AnyCamera, info: ValidationInfo, cameras: Mapping[str, AnyCamera]) -> AnyCamera:
+    """Return a camera, one of `cameras` by name, with its calibration and trajectory files read."""
     if not isinstance(camera, Camera):
         return camera
     camera = camera.with_poses()
     # An invalid size is reported separately.
     image_size = _calibrated_size.get()
     size = image_size or info.data.get("size")
-    return camera.calibrated(size, is_image=image_size is not None) if size else camera
+    reference = cameras.get(camera.beside or "")
+    pair = reference if isinstance(reference, Camera) else None
+    return camera.calibrated(size, is_image=image_size is not None, reference=pair) if size else camera
 
 
 def _check_reference_camera(name: str, cameras: Mapping[str, AnyCamera]) -> None:

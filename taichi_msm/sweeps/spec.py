@@ -20,6 +20,7 @@ from pydantic import Field, field_validator, model_validator
 from typing_extensions import Self
 
 from taichi_msm.array_files import ARRAY_SUFFIXES
+from taichi_msm.camera_files.simcol import simcol_files
 from taichi_msm.errors import ArgumentError, Key, Problem, SceneError, truncate, windows_path_hint
 from taichi_msm.images import PICTURE_SUFFIXES, PictureError, file_sha256
 from taichi_msm.load import scene_file
@@ -238,7 +239,7 @@ class Sweep:
         names: list[str] = []
 
         def collect(_: Key, text: str) -> str:
-            names.append(text)
+            names.extend((text, *simcol_files(text)))
             return text
 
         _map_files((), self.scene.document.data, collect)

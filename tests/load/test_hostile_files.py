@@ -40,11 +40,29 @@ READERS: dict[str, tuple[Callable[[Path], object], tuple[str, ...]]] = {
         (
             *("", "%YAML:1.0\n---\nK: ", CAMERA + CAMERA.replace("1:", "2:") + "a", '{"K": "', "<a>\n<K>"),
             *("[StereoLeft]\nb=1\n", "[StereoLeft]\nb", "#polynomial coefficients\n", "1 PINHOLE 40 ", "1 PINHOLE\n"),
+            *('{"frames": [{"transform_matrix": "', "cam0=[", "cam0=[1 0 1; 0 1 1; 0 0 1]\n", "<document><sensor>"),
+            *("Pinhole 1 1 1 1 0\n4 3\ncrop\n", "Pinhole ", "[LEFT_CAM_HD]\nfx=1\n", '{"camera-calibration": {"'),
         ),
     ),
     "trajectory": (
         lambda path: read_poses(str(path), PoseKeys(poses_rate=5.0)),
-        ("", "# ", "t tx ty tz qx qy qz qw ", "0 0 0 0 0 0 0 1\n", "1 0 0 0 0 1 0 0 0 0 1 0\n", IMAGE, f"{IMAGE}1a"),
+        (
+            *(
+                "",
+                "# ",
+                "t tx ty tz qx qy qz qw ",
+                "0 0 0 0 0 0 0 1\n",
+                "1 0 0 0 0 1 0 0 0 0 1 0\n",
+                IMAGE,
+                f"{IMAGE}1a",
+            ),
+            *(
+                '{"frames": [{"transform_matrix": [',
+                '{"camera-pose": [',
+                "1,0,0,0,0,1,0,0,0,0,1,0,0,0,0,1\n",
+                "1 0 0 0\n",
+            ),
+        ),
     ),
     "scene": (load_scene, ("", "image: ", "sheet: {points: ")),
     "override": (lambda path: parse_override(path.read_text()), ("", "image=")),

@@ -104,6 +104,10 @@ KEYS: dict[str, tuple[list[tuple[str, str]], str]] = {
         [(LENS, "{calibration: camera.yaml}")],
         "scene.yaml:10:19: render.camera.calibration: camera.yaml",
     ),
+    "calibration of another folder": (
+        [(LENS, "{calibration: ../camera.yaml}")],
+        "scene.yaml:10:19: render.camera.calibration: ../camera.yaml",
+    ),
     "narrow region": ([("frame.png\n", "frame.png\nregion: [40, 0, 1, 20]\n")], "sheet.surface.depth.file: depth.npy"),
     "region": ([("frame.png\n", "frame.png\nregion: [40, 0, 20, 20]\n")], "region: [40, 0, 20, 20]"),
 }  # fmt: skip
@@ -116,6 +120,15 @@ def test_invalid_keys(name: str, depth: Path, message: Messages) -> None:
     with message.raises(SceneError, place) as caught:
         load_scene(change(*replacements))
     assert "\n" not in str(caught.value)
+
+
+def test_calibration_of_the_image(depth: Path) -> None:
+    """The calibration is one of the image; `render.size` may be a multiple of its size."""
+    Path("camera.yaml").write_text(CALIBRATION.replace("96", str(WIDTH)).replace("72", str(HEIGHT)))
+    change((LENS, "{calibration: camera.yaml}"))
+    for factor in (1, 2):
+        scene = load_scene("scene.yaml", {"render.size": [factor * WIDTH, factor * HEIGHT]})
+        assert scene.render.camera.intrinsics.fx == 40  # type: ignore[union-attr]
 
 
 def at(row: slice, column: slice, value: float) -> NDArray[Any]:

@@ -190,6 +190,19 @@ def test_paths_of_files(folder: Path) -> None:
     }
 
 
+def test_both_files_of_a_trajectory(folder: Path) -> None:
+    """Workers of a cluster get the rotations of SimCol3D with the positions that the sweep names."""
+    for name in ("SavedPosition_S1.txt", "SavedRotationQuaternion_S1.txt"):
+        (folder / name).write_text("0 0 1\n")
+    (folder / "poses.yaml").write_text(
+        "scene: small.yaml\nsamples: 1\nvary: {render.camera.poses: {choice: [SavedPosition_S1.txt]}}\n"
+    )
+    assert {Path(path).name for path in load_sweep("poses.yaml").files} >= {
+        "SavedPosition_S1.txt",
+        "SavedRotationQuaternion_S1.txt",
+    }
+
+
 def test_keys_that_name_files() -> None:
     schema = Scene.model_json_schema()
     keys = set()
