@@ -1,4 +1,4 @@
-"""Write docs/accuracy.md and its picture: a study of every shipped scene, and the results of the hard cases.
+"""Write docs/accuracy.md and its pictures: a study of every shipped scene, and the results of the hard cases.
 
     PYTHONPATH=. python docs/make_accuracy.py [--quick]
 
@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import json
 import math
+import shutil
 import statistics
 import subprocess
 import sys
@@ -252,6 +253,7 @@ def main() -> None:
         for name in SCENES:
             print(name, flush=True)
             studies[name] = study(name, out, *sys.argv[1:])
+        shutil.copy(out / "press" / "study.png", IMAGES)
         hard, soft = hard_table(out), sensitive(out)
     press, paper = studies["press"], studies["figure-3"]
     draw(paper)
