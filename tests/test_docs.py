@@ -353,6 +353,7 @@ def test_citation() -> None:
     assert citation["cff-version"] == "1.2.0"
     assert citation["version"] == taichi_msm.__version__
     assert citation["references"][0]["title"] in read(README)
+    assert f'authors = [{{ name = "{citation["authors"][0]["name"]}" }}]' in read(ROOT / "pyproject.toml")
 
 
 @pytest.mark.slow
