@@ -79,8 +79,8 @@ def animation(
         run(described, directory, estimate_error=False)
         first, *others = (Image.open(path) for path in sorted(Path(directory, "frames").iterdir()))
         duration = round(1000 / described.time.frames_per_second)
-        options = {"duration": duration, "loop": 0, "quality": 82, "method": 6}
-        first.save(IMAGES / f"{name}.webp", save_all=True, append_images=others, **options)
+        film = {"save_all": True, "append_images": others, "duration": duration, "loop": 0}
+        first.save(IMAGES / f"{name}.webp", None, **film, quality=82, method=6)
 
 
 def endoscope(size: int) -> None:
