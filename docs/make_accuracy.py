@@ -18,8 +18,14 @@ from itertools import pairwise, takewhile
 from pathlib import Path
 from typing import Any
 
+from matplotlib import style
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+from matplotlib.ticker import FuncFormatter, LogLocator
+
 from benchmarks import dop853, stored_form
 from benchmarks.marked import table
+from taichi_msm.plot_style import BLUE, DPI, SKY, STYLE, TWO_COLUMN_WIDTH, VERMILION
 from taichi_msm.study.measurements import REFERENCE_MARGIN, REFERENCE_RENDER
 from taichi_msm.system.compiler import compiler_label
 
@@ -40,12 +46,11 @@ def program(*arguments: str) -> subprocess.CompletedProcess[str]:
 
 
 def study(name: str, out: Path, *options: str) -> Record:
-    """Study a shipped scene, copy its picture, and return the record."""
+    """Study a shipped scene, and return the record."""
     words = ["study", f"scenes/{name}.yaml", "--tolerance", str(TOLERANCE), "--json", "--out", str(out / name)]
     done = program(*words, *options)
     if done.returncode:
         raise SystemExit(done.stderr)
-    shutil.copy(out / name / "study.png", IMAGES / f"accuracy-{name}.png")
     return json.loads(done.stdout)
 
 
@@ -66,6 +71,26 @@ def seconds_to(study: Record, method: str, error: float) -> float:
         if fine <= math.log(error) <= coarse:
             return math.exp(before + (after - before) * (coarse - math.log(error)) / (coarse - fine))
     return math.nan
+
+
+def draw(study: Record) -> None:
+    """Draw the errors of three methods against the step."""
+    with style.context(STYLE, after_reset=True):
+        figure = Figure(figsize=(TWO_COLUMN_WIDTH, 4), dpi=DPI, layout="constrained")
+        FigureCanvasAgg(figure)
+        axes = figure.subplots()
+        lines = ("f64 backward", VERMILION, "s"), ("f32 central", SKY, "D"), ("f64 central", BLUE, "o")
+        for method, colour, marker in lines:
+            steps, errors = zip(*((1000 * each["step"], each["error"]) for each in points(study, method)), strict=True)
+            order = study["orders"].get(method)
+            label = method if order is None else f"{method}, order {order:.2f}"
+            axes.loglog(steps, errors, color=colour, marker=marker, label=label)
+        axes.set(title=f"Error of {study['scene']}", xlabel="time step [ms]")
+        axes.set_ylabel("error, as a fraction of\nthe largest displacement")
+        axes.xaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
+        axes.xaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
+        axes.legend(fontsize=10)
+        figure.savefig(IMAGES / "accuracy.png", format="png")
 
 
 def significant(value: float | None, digits: int = 2) -> str:
@@ -228,8 +253,10 @@ def main() -> None:
         for name in SCENES:
             print(name, flush=True)
             studies[name] = study(name, out, *sys.argv[1:])
+        shutil.copy(out / "press" / "study.png", IMAGES)
         hard, soft = hard_table(out), sensitive(out)
     press, paper = studies["press"], studies["figure-3"]
+    draw(paper)
     first = points(press, "f32 central")[0]
     machine, versions = press["machine"], press["machine"]["versions"]
     stored = [[name, significant(error)] for name, error in stored_form.measure().items()]
@@ -256,7 +283,6 @@ def main() -> None:
             refine_table=refine_table(studies),
             own_refine=press["settings"]["render"]["refine"],
             supersample_table=supersample_table(press),
-            pictures="\n\n".join(f"![{name}](images/accuracy-{name}.png)" for name in SCENES if name != "press"),
             hard_table=hard,
         ),
         encoding="utf-8",

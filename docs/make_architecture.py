@@ -1,4 +1,4 @@
-"""Draw the layers of the package and the imports between them (transitive reduction), from the source.
+"""Draw the packages in the order of their imports, from the source.
 
     PYTHONPATH=. python docs/make_architecture.py
 
@@ -7,92 +7,69 @@ Writes docs/images/architecture.png.
 
 from __future__ import annotations
 
-from collections import Counter
+from itertools import pairwise
 from pathlib import Path
 
+from matplotlib import style
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
-from matplotlib.patches import FancyArrowPatch, FancyBboxPatch
+from matplotlib.patches import FancyBboxPatch
 
-from taichi_msm.plot_style import BLUE, DPI, GREY, INK
-from tests.test_architecture import LAYERS, MODULES, imports, module_name
+from taichi_msm.plot_style import BLUE, DPI, GREY, PALE, STYLE
+from tests.test_architecture import LAYER, MODULES
 
-# Without __init__ and __main__, which only lead to the others.
-SHOWN = [[name for name in sorted(layer) if not name.startswith("__")] for layer in LAYERS]
-WIDTH, HEIGHT, GAP, PITCH = 1.7, 0.62, 1.12, 2.3
+# Packages by purpose. Modules without a package are those that several import, and have no boxes.
+ROWS = {
+    "command line": ("cli",),
+    "measurements": ("fitting", "palpation", "machines"),
+    "uses of runs": ("study", "sweeps", "view", "exports"),
+    "a run": ("runs", "gradients", "load", "render"),
+    "numerics": ("accuracy", "solver", "terms"),
+    "scene and sheet": ("model", "cameras", "scene"),
+    "files": ("camera_files", "surfaces"),
+    "formulas": ("laws", "lenses", "shapes"),
+    "machine": ("system",),
+}
+WIDTH, HEIGHT, PITCH, STEP, LABEL = 1.5, 0.44, 1.65, 0.62, 1.75
 
 
-def arrows() -> Counter[tuple[str, str]]:
-    """Count the imports from a module or package to another."""
-    edges: Counter[tuple[str, str]] = Counter()
-    for path in MODULES:
-        upper = module_name(path).split(".")[0]
-        edges.update((upper, lower) for name in imports(path) if (lower := name.split(".")[0]) != upper)
-    return edges
-
-
-def direct(edges: Counter[tuple[str, str]]) -> Counter[tuple[str, str]]:
-    """Return the edges of the transitive reduction."""
-
-    def leads(start: str, end: str) -> bool:
-        return any(lower == end or leads(lower, end) for upper, lower in edges if upper == start)
-
-    return Counter(
-        {
-            (upper, lower): count
-            for (upper, lower), count in edges.items()
-            if not any(leads(middle, lower) for start, middle in edges if start == upper and middle != lower)
-        }
-    )
+def check() -> None:
+    """Refuse a table that lacks a package, or whose order is not that of the imports."""
+    order = [name for row in ROWS.values() for name in row]
+    packages = {path.parent.name for path in MODULES if path.name == "__init__.py"} - {"taichi_msm"}
+    levels = [[LAYER[name] for name in row] for row in ROWS.values()]
+    assert set(order) == packages, set(order) ^ packages
+    assert all(min(upper) >= max(lower) for upper, lower in pairwise(levels)), "rows are not in order"
+    assert all(row == sorted(row, reverse=True) for row in levels), "packages of a row are not in order"
 
 
 def main() -> None:
     """Write the diagram."""
-    layers = [layer for layer in SHOWN if layer]
-    centres = {
-        name: (PITCH * (column - (len(layer) - 1) / 2), GAP * level)
-        for level, layer in enumerate(layers)
-        for column, name in enumerate(layer)
-    }
-    reach = (PITCH * (max(map(len, layers)) - 1) + WIDTH) / 2 + 0.1
-    figure = Figure(figsize=(2.12 * reach, 8.4), dpi=DPI, layout="constrained")
-    FigureCanvasAgg(figure)
-    axes = figure.subplots()
-    axes.set_axis_off()
-    axes.set_xlim(-reach, reach)
-    axes.set_ylim(-0.6, GAP * (len(layers) - 1) + 0.6)
-    for (upper, lower), count in direct(arrows()).items():
-        if upper in centres and lower in centres:
-            (x, y), (to_x, to_y) = centres[upper], centres[lower]
-            bend = 0.0 if abs(x - to_x) > 0.1 or y - to_y < 1.5 * GAP else 0.45
-            arrow = FancyArrowPatch(
-                (x, y - HEIGHT / 2),
-                (to_x, to_y + HEIGHT / 2),
-                connectionstyle=f"arc3,rad={bend}",
-                arrowstyle="-|>",
-                mutation_scale=9,
-                linewidth=0.6 + 0.12 * min(count, 12),
-                color=GREY,
-                alpha=0.75,
-            )
-            axes.add_patch(arrow)
-    packages = {path.parent.name for path in MODULES if path.name == "__init__.py"}
-    for name, (x, y) in centres.items():
-        filled = name in packages
-        box = FancyBboxPatch(
-            (x - WIDTH / 2, y - HEIGHT / 2),
-            WIDTH,
-            HEIGHT,
-            boxstyle="round,pad=0,rounding_size=0.08",
-            facecolor=BLUE if filled else "white",
-            edgecolor=BLUE,
-            linewidth=1.2,
-            zorder=3,
-        )
-        axes.add_patch(box)
-        text = f"{name}/" if filled else f"{name}.py"
-        axes.text(x, y, text, ha="center", va="center", color="white" if filled else INK, fontsize=10, zorder=4)
-    figure.savefig(Path(__file__).parent / "images" / "architecture.png", format="png")
+    check()
+    width = LABEL + PITCH * max(map(len, ROWS.values()))
+    with style.context(STYLE, after_reset=True):
+        figure = Figure(figsize=(width, STEP * len(ROWS)), dpi=DPI)
+        FigureCanvasAgg(figure)
+        axes = figure.add_axes((0, 0, 1, 1))
+        axes.set_axis_off()
+        axes.set(xlim=(0, width), ylim=(STEP * len(ROWS), 0))
+        for row, (title, names) in enumerate(ROWS.items()):
+            middle = STEP * (row + 0.5)
+            axes.text(LABEL - 0.2, middle, title, ha="right", va="center", color=GREY, fontsize=11)
+            axes.axhspan(STEP * row, STEP * (row + 1), color=PALE if row % 2 else "white", alpha=0.5, zorder=0)
+            for column, name in enumerate(names):
+                left = LABEL + PITCH * column
+                box = FancyBboxPatch(
+                    (left, middle - HEIGHT / 2),
+                    WIDTH,
+                    HEIGHT,
+                    boxstyle="round,pad=0,rounding_size=0.08",
+                    facecolor=BLUE,
+                    edgecolor="none",
+                )
+                axes.add_patch(box)
+                axes.text(left + WIDTH / 2, middle, f"{name}/", ha="center", va="center", color="white", fontsize=12)
+        figure.savefig(Path(__file__).parent / "images" / "architecture.png", format="png")
 
 
 if __name__ == "__main__":

@@ -9,19 +9,20 @@ from __future__ import annotations
 
 import asyncio
 import json
-import shutil
 import tempfile
 from pathlib import Path
 
 import matplotlib.pyplot as plt
 import numpy as np
 import skimage
+from matplotlib import style
 from numpy.typing import NDArray
 from PIL import Image
 
 from taichi_msm import Simulation, load_scene, run
 from taichi_msm.cli.main import main as main_of_program
 from taichi_msm.load.scene_file import plan_file
+from taichi_msm.plot_style import BLUE, DPI, GREY, INK, ONE_COLUMN_WIDTH, STYLE, TWO_COLUMN_WIDTH, VERMILION
 from taichi_msm.scene.camera import Camera
 from taichi_msm.sweeps.spec import load_sweep
 from taichi_msm.view.recording import Captures
@@ -42,6 +43,17 @@ MOMENTS = {"drag": 1.12, "two-tools": 0.84, "tumour": 2.2}
 # The stages of the paper's figure 3: at rest, pressed, pressed fully, let go.
 STAGES = (0.0, 0.2, 0.4, 0.64)
 
+# Half the frames of the shipped scenes.
+SLOW = "time.frames_per_second=12.5"
+
+# The scene press on a dome.
+DOME = (
+    SLOW,
+    "sheet.surface={dome: {radius: 0.064}}",
+    "render.camera={eye: [0, -0.09, 0.075], target: [0, -0.012, -0.008], fov: 42}",
+    "render.light={ambient: 0, relief: -0.1, gloss: 0.3}",
+)
+
 # A fundus photograph, CC0, NHS Foundation Trust; it comes with scikit-image.
 RETINA = Path(skimage.__file__).parent / "data" / "retina.jpg"
 
@@ -60,15 +72,19 @@ def frames(scene_file: Path, moments: tuple[float, ...], size: tuple[int, int]) 
 def animation(
     name: str, scene: str, size: int, *overrides: str, image: Path | None = None, height: int | None = None
 ) -> None:
-    """Write the GIF of a scene, in another size (by default square) or on another picture."""
-    settings = [f"render.size=[{size},{height or size}]", "render.supersample=2", "output=[gif]", *overrides]
+    """Write the film of a scene as an animated WebP, in another size (by default square) or on another picture."""
+    settings = [f"render.size=[{size},{height or size}]", "render.supersample=2", "output=[png]", *overrides]
+    described = load_scene(SCENES / f"{scene}.yaml", settings, image)
     with tempfile.TemporaryDirectory() as directory:
-        run(load_scene(SCENES / f"{scene}.yaml", settings, image), directory, overrides=settings)
-        shutil.copy(Path(directory) / "animation.gif", IMAGES / f"{name}.gif")
+        run(described, directory, estimate_error=False)
+        first, *others = (Image.open(path) for path in sorted(Path(directory, "frames").iterdir()))
+        duration = round(1000 / described.time.frames_per_second)
+        film = {"save_all": True, "append_images": others, "duration": duration, "loop": 0}
+        first.save(IMAGES / f"{name}.webp", None, **film, quality=82, method=6)
 
 
 def endoscope(size: int) -> None:
-    """Write the GIF of the scene endoscope, in another size, with every fourth frame."""
+    """Write the film of the scene endoscope, in another size, with every second frame."""
     shipped = load_scene(SCENES / "endoscope.yaml")
     assert isinstance(shipped.render.camera, Camera)
     assert shipped.render.camera.intrinsics is not None
@@ -78,7 +94,7 @@ def endoscope(size: int) -> None:
         name: round((value + 0.5) * share - 0.5 if name in ("cx", "cy") else value * share, 2)
         for name, value in shipped.render.camera.intrinsics.model_dump().items()
     }
-    rate = shipped.time.frames_per_second / 4
+    rate = shipped.time.frames_per_second / 2
     smaller = (f"render.camera.intrinsics={json.dumps(values)}", f"time.frames_per_second={rate:g}")
     animation("endoscope", "endoscope", size, *smaller)
 
@@ -90,17 +106,17 @@ def four_pixels() -> None:
     axes.axis("off")
     axes.imshow([[0.93, 0.87], [0.87, 0.93]], cmap="gray", vmin=0, vmax=1, extent=(0, 2, 2, 0))
     for edge in range(3):
-        axes.plot([0, 2.2], [edge, edge], color="0.6", linewidth=1)
-        axes.plot([edge, edge], [0, 2.2], color="0.6", linewidth=1)
-        axes.annotate(f"{edge}", (edge, -0.08), ha="center", va="bottom", color="firebrick")
-        axes.annotate(f"{edge}", (-0.08, edge), ha="right", va="center", color="firebrick")
+        axes.plot([0, 2.2], [edge, edge], color=GREY, linewidth=1)
+        axes.plot([edge, edge], [0, 2.2], color=GREY, linewidth=1)
+        axes.annotate(f"{edge}", (edge, -0.08), ha="center", va="bottom", color=VERMILION)
+        axes.annotate(f"{edge}", (-0.08, edge), ha="right", va="center", color=VERMILION)
     for across in range(2):
         for down in range(2):
             centre = across + 0.5, down + 0.5
-            axes.plot(*centre, "o", color="black", markersize=4)
-            axes.annotate(f"({centre[0]}, {centre[1]})", (centre[0], down + 0.34), ha="center", color="firebrick")
-            axes.annotate(f"({across}, {down})", (centre[0], down + 0.78), ha="center", color="navy")
-    for text, colour, at in (("from the corner of the picture", "firebrick", -0.42), ("OpenCV", "navy", 2.42)):
+            axes.plot(*centre, "o", color=INK, markersize=4)
+            axes.annotate(f"({centre[0]}, {centre[1]})", (centre[0], down + 0.34), ha="center", color=VERMILION)
+            axes.annotate(f"({across}, {down})", (centre[0], down + 0.78), ha="center", color=BLUE)
+    for text, colour, at in (("from the corner of the picture", VERMILION, -0.42), ("OpenCV", BLUE, 2.42)):
         axes.annotate(text, (1, at), ha="center", color=colour)
     figure.savefig(IMAGES / "pixels.png", dpi=110)
 
@@ -118,7 +134,7 @@ def stereo(moment: float, size: int) -> None:
         run(scene, directory)
         pair = [Image.open(Path(directory, name, "frames", f"{frame:04}.png")).convert("RGB") for name in cameras]
         disparity = np.array(Image.open(Path(directory, "left", "disparity", f"{frame:04}.tiff")))
-    figure, axes = plt.subplots(1, 3, figsize=(10.4, 3.2), layout="constrained")
+    figure, axes = plt.subplots(1, 3, figsize=(TWO_COLUMN_WIDTH, 2.9), layout="constrained")
     shown = np.where(disparity > 0, disparity, np.nan)
     axes[0].imshow(pair[0])
     axes[1].imshow(pair[1])
@@ -127,7 +143,7 @@ def stereo(moment: float, size: int) -> None:
         axis.set_title(title)
         axis.axis("off")
     figure.colorbar(image, ax=axes[2])
-    figure.savefig(IMAGES / "stereo.jpg", dpi=110, pil_kwargs={"quality": 90})
+    figure.savefig(IMAGES / "stereo.jpg", dpi=130, pil_kwargs={"quality": 90})
 
 
 def depth_frame(moment: float) -> None:
@@ -141,7 +157,7 @@ def depth_frame(moment: float) -> None:
         files = scene.image, SCENES / "textures" / "frame-depth.png", folder / "frames" / f"{frame:04}.png"
         picture, counts, pressed = (np.array(Image.open(file)) for file in files)
         flow: Floats = np.fromfile(folder / "flow" / f"{frame:04}.flo", "<f4", offset=12).reshape(*counts.shape, 2)
-    figure, axes = plt.subplots(2, 2, figsize=(8.8, 6.6), layout="constrained")
+    figure, axes = plt.subplots(2, 2, figsize=(8, 6), layout="constrained")
     length = np.where(np.abs(flow[..., 0]) < 1e9, np.hypot(flow[..., 0], flow[..., 1]), np.nan)
     axes[0, 0].imshow(picture)
     figure.colorbar(axes[0, 1].imshow(0.02 * counts, cmap="viridis"), ax=axes[0, 1])
@@ -154,7 +170,7 @@ def depth_frame(moment: float) -> None:
     for axis, title in zip(axes.flat, titles, strict=True):
         axis.set_title(title)
         axis.axis("off")
-    figure.savefig(IMAGES / "frame.jpg", dpi=90, pil_kwargs={"quality": 88})
+    figure.savefig(IMAGES / "frame.jpg", dpi=100, pil_kwargs={"quality": 88})
 
 
 def forces_of(name: str) -> tuple[Floats, Floats, Floats]:
@@ -175,20 +191,22 @@ def indentation() -> None:
     time, tip, force = forces_of("indent")
     depth, upward = -1000 * tip[:, 2], -force[:, 2]
     deepest = int(depth.argmax())
-    figure, (over_time, over_depth) = plt.subplots(1, 2, figsize=(9, 3.4), sharey=True, layout="constrained")
-    over_time.plot(time, upward, "o-", color="firebrick", markersize=3)
-    over_time.set(xlabel="time [s]", ylabel="force on the tip [N]")
-    over_depth.plot(
-        depth[: deepest + 1], upward[: deepest + 1], "o-", color="firebrick", markersize=4, label="going down"
+    figure, (over_time, over_depth) = plt.subplots(
+        1, 2, figsize=(TWO_COLUMN_WIDTH, 3.4), sharey=True, layout="constrained"
     )
-    over_depth.plot(depth[deepest:], upward[deepest:], "x", color="black", markersize=5, label="coming up")
+    over_time.plot(time, upward, "o-", color=BLUE, markersize=3)
+    over_time.set(xlabel="time [s]", ylabel="force on the tip [N]")
+    over_depth.plot(depth[: deepest + 1], upward[: deepest + 1], "o-", color=BLUE, markersize=4, label="going down")
+    over_depth.plot(
+        depth[deepest:], upward[deepest:], "o", color=VERMILION, markersize=8, fillstyle="none", label="coming up"
+    )
     slopes = [np.polyfit(depth[part], upward[part], 1) for part in (slice(1, 4), slice(deepest - 2, deepest + 1))]
-    for slope, ends, label in zip(slopes, ([0, 3.2], [2.8, 6]), ([3.2, 0.17], [3.9, 0.55]), strict=True):
-        over_depth.plot(ends, np.polyval(slope, ends), "--", color="grey", linewidth=1)
+    for slope, ends, label in zip(slopes, ([0, 3.2], [2.8, 6]), ([3.3, 0.17], [3.4, 0.55]), strict=True):
+        over_depth.plot(ends, np.polyval(slope, ends), "--", color=GREY, linewidth=1)
         over_depth.annotate(f"{slope[0]:.2f} N/mm", label)
     over_depth.set(xlabel="depth of the tip [mm]")
-    over_depth.legend(frameon=False, loc="upper left")
-    figure.savefig(IMAGES / "indent.png", dpi=130)
+    over_depth.legend(loc="upper left")
+    figure.savefig(IMAGES / "indent.png", dpi=DPI)
 
 
 def palpation() -> None:
@@ -197,16 +215,19 @@ def palpation() -> None:
     scene = load_scene(SCENES / "tumour.yaml")
     deepest = tip[:, 2] <= tip[:, 2].min() + 1e-9
     width = 1000 * scene.sheet.size[1]
-    figure, (force_axes, map_axes) = plt.subplots(2, 1, figsize=(6.4, 4.4), sharex=True, layout="constrained")
-    force_axes.bar(1000 * tip[deepest, 0], np.linalg.norm(force[deepest], axis=1), width=5, color="firebrick")
+    figure, (force_axes, map_axes) = plt.subplots(
+        2, 1, figsize=(ONE_COLUMN_WIDTH, 4.4), sharex=True, layout="constrained"
+    )
+    force_axes.bar(1000 * tip[deepest, 0], np.linalg.norm(force[deepest], axis=1), width=5, color=BLUE)
     force_axes.set(ylabel="force 3 mm deep [N]", box_aspect=1 / 3)
     with Image.open(SCENES / "textures" / "tumour.png") as stiffness:
         third = stiffness.height // 3
         middle = np.asarray(stiffness)[third:-third]
+        map_axes.grid(visible=False)
         map_axes.imshow(middle, cmap="gray", extent=(-width / 2, width / 2, -width / 6, width / 6))
-    map_axes.plot(1000 * tip[deepest, 0], 1000 * tip[deepest, 1], "o", color="firebrick")
+    map_axes.plot(1000 * tip[deepest, 0], 1000 * tip[deepest, 1], "o", color=VERMILION)
     map_axes.set(xlabel="position of the tip, from the middle of the sheet [mm]", ylabel="[mm]")
-    figure.savefig(IMAGES / "palpation.png", dpi=130)
+    figure.savefig(IMAGES / "palpation.png", dpi=DPI)
 
 
 def live(name: str, size: int, rate: float, seconds: float) -> None:
@@ -286,18 +307,19 @@ def grid(pictures: list[Image.Image], columns: int, gap: int = 6) -> Image.Image
 def main() -> None:
     """Write every picture."""
     IMAGES.mkdir(exist_ok=True)
-    animation("press", "press", 320)
-    animation("grasp", "grasp", 320)
-    animation("kidney", "kidney", 320)
-    animation("incision", "incision", 320)
-    animation("frame", "frame", 320, "time.frames_per_second=12.5", height=256)
-    depth_frame(0.36)
-    endoscope(224)
-    four_pixels()
-    stereo(0.8, 400)
-    animation("retina", "grasp", 320, image=RETINA)
-    indentation()
-    palpation()
+    animation("press", "press", 384)
+    animation("kidney", "kidney", 384, SLOW, "time.duration=2.24")
+    animation("incision", "incision", 384, SLOW)
+    animation("frame", "frame", 400, SLOW, height=320)
+    animation("retina", "grasp", 384, image=RETINA)
+    animation("dome", "press", 384, *DOME, image=RETINA)
+    endoscope(384)
+    with style.context(STYLE, after_reset=True):
+        depth_frame(0.36)
+        four_pixels()
+        stereo(0.8, 400)
+        indentation()
+        palpation()
     live("live", 250, 10, 4.8)
     page(1280, 800)
     stages = frames(SCENES / "figure-3.yaml", STAGES, (560, 420))

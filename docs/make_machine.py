@@ -170,7 +170,7 @@ def write_page(record: dict[str, Any]) -> None:
 def draw(pressed: FitResult, pulled: FitResult) -> None:
     """Draw measured and fitted forces over time and over depth."""
     with plt.style.context(STYLE, after_reset=True):
-        figure, axes = plt.subplots(1, 3, figsize=(12, 3.6), layout="constrained")
+        figure, axes = plt.subplots(1, 3, figsize=(9, 3.2), layout="constrained")
         titles = "Beef, pressed and held", "Beef", "Pig skin, pulled"
         for panel, title, result in zip(axes, titles, (pressed, pressed, pulled), strict=True):
             (test,) = result.tests

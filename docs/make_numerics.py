@@ -1,4 +1,4 @@
-"""Write docs/numerics.md and its pictures: results of the program against independent solutions.
+"""Write docs/numerics.md and its picture: results of the program against independent solutions.
 
     PYTHONPATH=. python docs/make_numerics.py
 
@@ -27,7 +27,7 @@ from taichi_msm.model.loads import evaluate_loads
 from taichi_msm.model.plan import Plan
 from taichi_msm.model.sheet import fixed_points, rest_positions, spacing
 from taichi_msm.model.time_grid import Precision
-from taichi_msm.plot_style import BLUE, DPI, GREY, STYLE, TWO_COLUMN_WIDTH, VERMILION
+from taichi_msm.plot_style import BLUE, DPI, GREY, PALE, STYLE, TWO_COLUMN_WIDTH, VERMILION
 from taichi_msm.solver.dynamics import Dynamics
 from taichi_msm.solver.planning import make_plan
 from taichi_msm.solver.rest import QuasiStatics
@@ -143,39 +143,33 @@ def buckling() -> dict[str, Any]:
         modes.append(mode)
     dynamics.close()
     worst = int(np.argmin(values))
-    size = np.linalg.norm(modes[worst], axis=-1)
-    row = int(np.unravel_index(size.argmax(), size.shape)[0])
-    component = int(np.abs(modes[worst]).max(axis=(0, 1)).argmax())
-    along = modes[worst][row, :, component]
+    mode = modes[worst]
+    component = int(np.abs(mode).max(axis=(0, 1)).argmax())
+    row, column = np.unravel_index(np.abs(mode[..., component]).argmax(), mode.shape[:2])
+    window = np.s_[max(0, row - 10) : row + 11, max(0, column - 10) : column + 11]
+    largest = np.abs(mode[..., component]).max()
+    load = np.array(scene.probes[0].load)
 
     with style.context(STYLE, after_reset=True):
-        figure = Figure(figsize=(TWO_COLUMN_WIDTH, 3.2), dpi=DPI, layout="constrained")
+        figure = Figure(figsize=(TWO_COLUMN_WIDTH, 3.4), dpi=DPI, layout="constrained")
         FigureCanvasAgg(figure)
-        left, middle, right = figure.subplots(1, 3, width_ratios=(1.4, 1, 1))
+        left, right = figure.subplots(1, 2, width_ratios=(1.7, 1))
         left.axhline(0, color=GREY, linewidth=0.8)
-        left.plot(times, values, "o-", color=BLUE, markersize=3)
-        left.set(title=f"Smallest eigenvalue, springs {BUCKLING} × as stiff", xlabel="time [s]", ylabel="N/m")
-        load = np.array(scene.probes[0].load)
-        twin = left.twinx()
-        twin.plot(*load.T, color=VERMILION, linewidth=1)
-        twin.set_ylim(0, 400)
-        twin.grid(visible=False)
-        twin.set_yticks([0, 100])
-        twin.set_ylabel("load [%]", color=VERMILION, loc="bottom")
-        mode = modes[worst]
-        middle.imshow(np.linalg.norm(mode, axis=-1), cmap="magma")
-        middle.set(title=f"Its mode at {times[worst]:g} s: size", xticks=[], yticks=[])
-        column = int(np.abs(along).argmax())
-        window = np.s_[max(0, row - 10) : row + 11, max(0, column - 10) : column + 11]
-        largest = np.abs(mode[..., component]).max()
-        right.imshow(mode[..., component][window], cmap="RdBu", vmin=-largest, vmax=largest)
-        right.set(title=f"and {'xyz'[component]}, around its largest point", xticks=[], yticks=[])
+        left.axvspan(load[0, 0], load[-1, 0], color=PALE, zorder=0)
+        left.annotate("loaded", (load[-1, 0] / 2, 0.97), xycoords=("data", "axes fraction"), ha="center", va="top")
+        left.plot(times, values, "o-", color=BLUE, markersize=4)
+        left.plot(times[worst], values[worst], "o", color=VERMILION, markersize=8)
+        left.annotate("the mode on the right", (times[worst] + 0.03, values[worst]), va="center", color=VERMILION)
+        left.set(title="Smallest eigenvalue of the stiffness", xlabel="time [s]", ylabel="N/m; unstable below 0")
+        left.set_ylim(top=1.3)
+        right.imshow(mode[..., component][window], cmap="PuOr", vmin=-largest, vmax=largest)
+        right.set(title=f"Its mode, close up ({'xyz'[component]})", xticks=[], yticks=[])
         figure.savefig(IMAGES / "numerics-buckling.png", format="png")
     return {"buckled": f"{values[worst]:.2g}", "unloaded": f"{values[0]:.2g}"}
 
 
 def energy() -> dict[str, Any]:
-    """Measure and draw the energy of an undamped sheet over many steps."""
+    """Measure the energy of an undamped sheet over many steps."""
     press_time, every, rows = 0.2, 20, []
     scene = load_scene(ROOT / "tests" / "hard" / "undamped.yaml", [f"time.duration={ENERGY_STEPS}"])
     assert scene.springs is not None
@@ -186,32 +180,21 @@ def energy() -> dict[str, Any]:
     made = base.model_copy(update={"probes": (probe,)})
     time = {"duration": ENERGY_STEPS // every / rate, "frames_per_second": rate, "step": h, "tolerance": None}
     made = made.model_copy(update={"time": made.time.model_copy(update=time)})
-    with style.context(STYLE, after_reset=True):
-        figure = Figure(figsize=(TWO_COLUMN_WIDTH, 2.8), dpi=DPI, layout="constrained")
-        FigureCanvasAgg(figure)
-        axes = figure.subplots()
-        colours: dict[Precision, str] = {"f32": VERMILION, "f64": BLUE}
-        for kind, colour in colours.items():
-            dynamics = Dynamics(make_plan(made).with_grid(precision=kind), runtime.current_device())
-            energies = []
-            for _ in range(ENERGY_STEPS // every):
-                dynamics.advance(every)
-                energies.append(dynamics.read().energy)
-            dynamics.close()
-            steps = every * np.arange(1, len(energies) + 1)
-            free = steps * h > press_time + every * h
-            released = np.array(energies)[free]
-            mean = released.mean()
-            tenth = len(released) // 10
-            drift = released[-tenth:].mean() / released[:tenth].mean() - 1
-            swing = np.abs(released / mean - 1).max()
-            rows.append([kind, f"{mean:.4g} J", f"{100 * swing:.2g} %", f"{100 * drift:+.1g} %"])
-            axes.plot(steps[free], released / mean, color=colour, linewidth=0.8, label=kind)
-        axes.set(
-            xlabel="steps", ylabel="energy / its mean", title=f"Energy of an undamped sheet, read every {every} steps"
-        )
-        axes.legend()
-        figure.savefig(IMAGES / "numerics-energy.png", format="png")
+    kinds: tuple[Precision, ...] = "f32", "f64"
+    for kind in kinds:
+        dynamics = Dynamics(make_plan(made).with_grid(precision=kind), runtime.current_device())
+        energies = []
+        for _ in range(ENERGY_STEPS // every):
+            dynamics.advance(every)
+            energies.append(dynamics.read().energy)
+        dynamics.close()
+        steps = every * np.arange(1, len(energies) + 1)
+        released = np.array(energies)[steps * h > press_time + every * h]
+        mean = released.mean()
+        tenth = len(released) // 10
+        drift = released[-tenth:].mean() / released[:tenth].mean() - 1
+        swing = np.abs(released / mean - 1).max()
+        rows.append([kind, f"{mean:.4g} J", f"{100 * swing:.2g} %", f"{100 * drift:+.1g} %"])
     return {
         "energy_points": " × ".join(map(str, made.sheet.points)),
         "energy_press": press_time,

@@ -1,17 +1,21 @@
-"""Write the tables of keys and camera files into the pages, from the program's descriptions.
+"""Write the tables of keys, camera files and public names into the pages, from the program's descriptions.
 
 PYTHONPATH=. python docs/make_tables.py
 """
 
 from __future__ import annotations
 
+import inspect
 import json
+import re
 from collections.abc import Callable, Iterator, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any
 
+import taichi_msm
 from benchmarks.marked import replace_marked
+from taichi_msm import datasets
 from taichi_msm.camera_files.calibration import CalibrationReader
 from taichi_msm.camera_files.readers import CALIBRATION_READERS, TRAJECTORY_READERS
 from taichi_msm.camera_files.trajectory import TrajectoryReader
@@ -22,6 +26,19 @@ from taichi_msm.sweeps.spec import SweepSettings
 from taichi_msm.view.events import KEYS, POINTER
 
 DOCS = Path(__file__).parent
+
+# Public names by the parts of the page on them; members of the classes of `SCENES` are keys of a scene.
+NAMES = {
+    "running": "run resume Simulation Playback load_scene sweep Outcome export",
+    "data sets": "datasets.Pairs datasets.Clips datasets.Pair datasets.Clip",
+    "estimation": "fit FitResult FittedMap gradient Gradient",
+    "scenes": "Scene Sheet Tissue Foundation RelaxationBranch Stiffening StiffnessMap SheetMask Springs "
+    "RestSurface DepthMap HeightField Tube Folds Dome PointGrid Probe Instrument Time Render Light Camera "
+    "Intrinsics Distortion Pose",
+    "results": "Labels Flow Sight Surface TipForce",
+    "errors": "MsmError SceneError ArgumentError DivergedError DeviceError FilesError NotInstalledError",
+}
+SCENES = "scenes"
 
 
 def rows(section: dict[str, Any], definitions: dict[str, Any], prefix: str = "") -> Iterator[str]:
@@ -81,6 +98,54 @@ def readers(table: Sequence[CalibrationReader] | Sequence[TrajectoryReader]) -> 
     return "| program | file | keys of the camera |\n|---|---|---|\n" + "\n".join(lines) + "\n"
 
 
+def section_of(docstring: str, title: str) -> str:
+    """Return the text of a section of a docstring, with its line breaks; empty without one."""
+    found = re.search(rf"^{title}:\n(.*?)(?=\n\n|\Z)", docstring, re.MULTILINE | re.DOTALL)
+    return inspect.cleandoc(f"\n{found[1]}") if found else ""
+
+
+def members(cls: type) -> Iterator[tuple[str, str]]:
+    """Yield name and meaning of attributes, from docstrings or comments of fields, and of methods of a class."""
+    described = section_of(inspect.getdoc(cls) or "", "Attributes")
+    for line in re.sub(r"\n +", " ", described).splitlines():
+        name, _, text = line.partition(": ")
+        yield name, text
+    if not described:
+        yield from re.findall(r"^    (\w+): \S.*?  # (.*)", inspect.getsource(cls), re.MULTILINE)
+    for name, value in vars(cls).items():
+        if name[0] != "_" and inspect.isfunction(value):
+            yield call(name, value), meaning(value)
+        elif name[0] != "_" and isinstance(value, property):
+            yield name, meaning(value)
+
+
+def call(name: str, function: Callable[..., Any]) -> str:
+    """Return a function with its required arguments."""
+    parameters = [each for each in inspect.signature(function).parameters.values() if each.name != "self"]
+    required = [each.name for each in parameters if each.default is each.empty and each.kind != each.VAR_KEYWORD]
+    return f"{name}({', '.join(required + ['...'] * (len(required) < len(parameters)))})"
+
+
+def meaning(item: Any) -> str:
+    """Return the first line of a docstring, and the section on the returned value."""
+    text = inspect.getdoc(item) or ""
+    value = " ".join(section_of(text, "Returns").split())
+    return text.splitlines()[0] + (f" Returns: {value[0].lower()}{value[1:]}" if value else "")
+
+
+def api(names: str, with_members: bool) -> str:
+    """Return the table of public names, a line each, with those of their members."""
+    lines = []
+    for name in names.split():
+        item = getattr(datasets if "." in name else taichi_msm, name.split(".")[-1])
+        lines.append((call(name, item) if inspect.isfunction(item) else name, meaning(item)))
+        for cls in inspect.getmro(item)[::-1] if isinstance(item, type) and with_members else ():
+            if cls.__module__.startswith("taichi_msm"):
+                lines += [(f".{member}", text) for member, text in members(cls)]
+    rows = [f"| `{name}` | {text.removesuffix('.')} |\n" for name, text in lines]
+    return "| name | content |\n|---|---|\n" + "".join(rows)
+
+
 # Functions that make the tables, by page and name.
 TABLES: dict[tuple[str, str], Callable[[], str]] = {
     ("keys", "keys"): scene_keys,
@@ -89,6 +154,7 @@ TABLES: dict[tuple[str, str], Callable[[], str]] = {
     ("sweep", "distributions"): partial(model_keys, Distribution, "way", "how the key varies", "value"),
     ("cameras", "calibrations"): partial(readers, CALIBRATION_READERS),
     ("cameras", "trajectories"): partial(readers, TRAJECTORY_READERS),
+    **{("api", part): partial(api, names, part != SCENES) for part, names in NAMES.items()},
 }
 
 

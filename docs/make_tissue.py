@@ -144,9 +144,9 @@ def draw_stretching() -> None:
                 for name, (law, shape, _) in solids.items()
             }
             print(f"equibiaxial at {stretch}: sheet {equal[at]:.3g}, over solids", ratios)
-        uniaxial_axes.set(title="Stretched in one direction", ylabel="force / (E · section at rest)", ylim=(0, 1.5))
-        biaxial_axes.set(title="Stretched equally in both", ylabel="force / (E · section at rest)", ylim=(0, 3))
-        width_axes.set(title="Width, stretched in one direction", ylabel="width / width at rest", ylim=(0.4, 1))
+        uniaxial_axes.set(title="One direction", ylabel="force / (E · section at rest)", ylim=(0, 1.5))
+        biaxial_axes.set(title="Both directions equally", ylabel="force / (E · section at rest)", ylim=(0, 3))
+        width_axes.set(title="Width, one direction", ylabel="width / width at rest", ylim=(0.4, 1))
         for axes in (uniaxial_axes, biaxial_axes, width_axes):
             axes.set(xlabel="stretch", xlim=(1, 1.4))
         uniaxial_axes.legend(loc="upper left")
@@ -218,7 +218,7 @@ def draw_relaxation() -> None:
         right.set(xscale="log", xlim=t[[0, -1]], ylim=(0, 1.05))
         right.xaxis.set_major_formatter("{x:g}")
         right.text(times[2] * 1.1, 0.98, "times of the branches", color=GREY, fontsize=7.5)
-        right.legend(title="ramp", loc="lower right")
+        right.legend(title="ramp", loc="center right", bbox_to_anchor=(1, 0.72))
         figure.savefig(IMAGES / "tissue-relaxation.png", dpi=DPI)
         plt.close(figure)
 

@@ -12,6 +12,9 @@ from mkdocs.structure.pages import Page
 
 ROOT = Path(__file__).parent.parent
 PAGES = ("CONTRIBUTING.md", "CHANGELOG.md")
+# A generated table of public names, and a class or function of it.
+NAMES = re.compile(r"<!-- ([\w ]+): made by docs/make_tables.py -->.*?<!-- end of \1 -->\n", re.DOTALL)
+NAME = re.compile(r"^\| `([A-Za-z][\w.]*)", re.MULTILINE)
 LINK = re.compile(r"\]\(([^)\s#]+)(#[^)\s]*)?\)")
 
 
@@ -42,8 +45,17 @@ def on_files(files: Files, config: MkDocsConfig) -> Files:
     return files
 
 
+def with_reference(table: re.Match[str]) -> str:
+    """Return a table of public names, followed by their signatures and docstrings."""
+    # Those of a scene are on the page of keys.
+    options = "    options:\n      members: false\n" if table[1] == "scenes" else ""
+    return table[0] + "".join(f"\n::: taichi_msm.{name}\n{options}" for name in NAME.findall(table[0]))
+
+
 def on_page_markdown(markdown: str, page: Page, files: Files, **_: object) -> str:
-    """Rewrite links to the paths of their targets in the site."""
+    """Rewrite links to the paths of their targets in the site, and complete the page of public names."""
+    if page.file.src_uri == "api.md":
+        markdown = NAMES.sub(with_reference, markdown)
 
     def moved(link: re.Match[str]) -> str:
         path, anchor = resolve(page.file.src_uri, link[1]), link[2] or ""

@@ -40,8 +40,10 @@ def _run(words: list[str]) -> tuple[int, Sequence[str]]:
     try:
         with common.show_grids("--quiet" in words or "--json" in words):
             return int(options.program.main(words, prog_name="taichi-msm", standalone_mode=False) or common.DONE), ()
-    except SystemExit:
-        # click raises SystemExit when the reader of stdout has exited.
+    except SystemExit as ended:
+        # click exits with 0 after completions for a shell, and with 1 when the reader of stdout has exited.
+        if ended.code == common.DONE:
+            return common.DONE, ()
         raise BrokenPipeError from None
     except SceneError as error:
         return common.INVALID_INPUT, error.lines

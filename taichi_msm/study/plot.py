@@ -232,9 +232,9 @@ def _legend(axes: Axes, handles: Sequence[Line2D], columns: int = 2) -> None:
         handles=handles,
         loc="upper left",
         bbox_to_anchor=(0, 0, 1, 0),
-        bbox_transform=offset_copy(axes.transAxes, figure, 0, -34, units="points"),
+        bbox_transform=offset_copy(axes.transAxes, figure, 0, -42, units="points"),
         mode="expand",
         borderaxespad=0,
         ncols=columns,
-        handlelength=2.8,
+        handlelength=2.2,
     )

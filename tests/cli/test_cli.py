@@ -61,6 +61,15 @@ def test_run_writes_all_outputs(small: Path, program: Program) -> None:
     assert (record["arch"], record["threads"], record["overrides"]) == ("cpu", 2, [])
 
 
+@pytest.mark.parametrize(("typed", "completed"), [("ru", "run"), ("run --estimate", "--estimate-error")])
+def test_completion_in_a_shell(typed: str, completed: str, program: Program, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("_TAICHI_MSM_COMPLETE", "bash_complete")
+    monkeypatch.setenv("COMP_WORDS", f"taichi-msm {typed}")
+    monkeypatch.setenv("COMP_CWORD", str(len(typed.split())))
+    done = program("--version")  # ignored
+    assert (done.returncode, done.stdout) == (0, f"plain,{completed}\n")
+
+
 def test_json_output_of_run(small: Path, program: Program) -> None:
     done = program("run", "small.yaml", "--json", "--set", "output=[]", "--out", "out")
     record = json.loads(done.stdout)
