@@ -21,10 +21,9 @@ from taichi_msm.runs.directory import replacing
 @click.argument("directory", metavar="[DIR]", default=".")
 def example(name: str | None, directory: str) -> None:
     """List the shipped scenes, or write scene NAME with its pictures into DIR, by default the current directory."""
-    shipped = scenes_folder()
-    scenes = {path.stem: path for pattern in ("*.yaml", "sweeps/*.yaml") for path in sorted(shipped.glob(pattern))}
+    shipped, scenes = scenes_folder(), shipped_scenes()
     if name is None:
-        click.echo("\n".join(f"{scene:16}{_summary(path)}" for scene, path in scenes.items()))
+        click.echo("\n".join(f"{scene:16}{summary(path)}" for scene, path in scenes.items()))
         return
     if name not in scenes:
         message = f"{name} is not a shipped scene{did_you_mean(name, scenes)}; `taichi-msm example` lists them"
@@ -36,7 +35,7 @@ def example(name: str | None, directory: str) -> None:
         with writing(target, "DIR"), replacing(target) as file:
             file.write(path.read_bytes())
         click.echo(printable(str(target)))
-    command = "sweep" if "vary" in _content(scenes[name]) else "run"
+    command = "sweep" if "vary" in content(scenes[name]) else "run"
     click.echo(printable(f"next: taichi-msm {command} {shlex.quote(str(targets[scenes[name]]))}"))
 
 
@@ -46,13 +45,21 @@ def scenes_folder() -> Path:
     return next(folder for folder in (package / "scenes", package.parent / "scenes") if folder.is_dir())
 
 
-def _content(path: Path) -> Any:
+def shipped_scenes() -> dict[str, Path]:
+    """Return the files of the shipped scenes and sweeps by name."""
+    return {
+        path.stem: path for pattern in ("*.yaml", "sweeps/*.yaml") for path in sorted(scenes_folder().glob(pattern))
+    }
+
+
+def content(path: Path) -> Any:
+    """Read the content of a scene file."""
     from taichi_msm.load.yaml_reader import read_yaml
 
     return read_yaml(path.read_text(encoding="utf-8")).data
 
 
-def _summary(path: Path) -> str:
+def summary(path: Path) -> str:
     """Return the first sentence of the comment at the head of a scene file."""
     lines = re.match("(#.*\n)+", path.read_text(encoding="utf-8"))
     return re.split(r"[:;] |(?<=[.?]) (?=[A-Z])", " ".join(lines[0].replace("#", "").split()))[0] if lines else ""
@@ -62,7 +69,7 @@ def _files(path: Path) -> Iterator[Path]:
     """Yield a shipped file and, recursively, the files that it names, also by patterns."""
     yield path
     if path.suffix == ".yaml":
-        for text in _texts(_content(path)):
+        for text in _texts(content(path)):
             for name in sorted(glob(text, root_dir=path.parent)):  # noqa: PTH207  # Path.glob refuses ".."
                 yield from _files((path.parent / name).resolve())
 

@@ -30,6 +30,7 @@ from taichi_msm.errors import Pause
 from taichi_msm.runs.media import Picture
 from taichi_msm.system.runtime import Device
 from taichi_msm.view import server as server_module
+from taichi_msm.view import web as web_module
 from taichi_msm.view.events import KEYS, MAX_BYTES, Event, parse_message
 from taichi_msm.view.material import MATERIAL
 from taichi_msm.view.recording import Captures
@@ -38,11 +39,10 @@ from taichi_msm.view.server import (
     MAX_PAGES,
     MAX_UNREAD_PICTURES,
     MAX_UNSENT_MESSAGES,
-    PAGE,
     Server,
-    listen,
 )
 from taichi_msm.view.session import Session
+from taichi_msm.view.web import FILES, Address
 from tests.conftest import Program
 from tests.golden import Messages
 from tests.view.chromium import PROGRAM, chromium
@@ -63,14 +63,15 @@ def session(small: Path, device: Device) -> Iterator[Session]:
 async def served(
     session: Session, *origins: str, warn: Callable[[str], None] = lambda line: None
 ) -> AsyncIterator[Server]:
-    server = Server(session, listen(0), "small.yaml", origins, warn)
-    running = asyncio.create_task(server.run(lambda: None))
-    try:
-        yield server
-    finally:
-        running.cancel()
-        with pytest.raises(asyncio.CancelledError):
-            await running
+    with Address(0, origins) as address:
+        server = Server(session, address, "small.yaml", warn)
+        running = asyncio.create_task(server.run(lambda: None))
+        try:
+            yield server
+        finally:
+            running.cancel()
+            with pytest.raises(asyncio.CancelledError):
+                await running
 
 
 class Client:
@@ -165,7 +166,7 @@ async def test_requests_need_the_token_and_a_known_origin(session: Session) -> N
         root, _, token = server.url.rstrip("/").rpartition("/")
         assert len(token) >= 32
         port = root.rpartition(":")[2]
-        for name in PAGE:
+        for name in ("", *FILES):
             assert await status(f"{server.url}{name}") == 200
         assert await status(server.url.rstrip("/")) == 200, "it is redirected to the page"
         for path in ("x", "socket/", "../view.js", "%2e%2e/server.py", "page/index.html"):
@@ -372,16 +373,16 @@ async def test_connections_are_bounded_in_number_and_time(
     ends: list[asyncio.Task[None]] = []
     async with served(session, warn=lines.append) as server:
         url = urlsplit(server.url)
-        monkeypatch.setattr(server_module, "MAX_REQUEST_S", 2.0)
+        monkeypatch.setattr(web_module, "MAX_REQUEST_S", 2.0)
         page, opened = await connect(server), monotonic()
-        monkeypatch.setattr(server_module, "MAX_REQUEST_S", WAIT_S)
-        monkeypatch.setattr(server_module, "MAX_CONNECTIONS", 1 + len(UNFINISHED))
+        monkeypatch.setattr(web_module, "MAX_REQUEST_S", WAIT_S)
+        monkeypatch.setattr(web_module, "MAX_CONNECTIONS", 1 + len(UNFINISHED))
         writers = await begin(2 * UNFINISHED)
         await asyncio.wait_for(asyncio.gather(*ends[len(UNFINISHED) :]), WAIT_S)
         await page.until(lambda state: True)
         assert not any(task.done() for task in ends[: len(UNFINISHED)])
-        monkeypatch.setattr(server_module, "MAX_CONNECTIONS", 64)
-        monkeypatch.setattr(server_module, "MAX_REQUEST_S", 0.3)
+        monkeypatch.setattr(web_module, "MAX_CONNECTIONS", 64)
+        monkeypatch.setattr(web_module, "MAX_REQUEST_S", 0.3)
         ends.clear()
         slow = await begin(UNFINISHED)
         deadline = monotonic() + WAIT_S
@@ -392,7 +393,7 @@ async def test_connections_are_bounded_in_number_and_time(
                     writer.write(b"a")
             await page.read()
             assert monotonic() < deadline
-        monkeypatch.setattr(server_module, "MAX_REQUEST_S", WAIT_S)
+        monkeypatch.setattr(web_module, "MAX_REQUEST_S", WAIT_S)
         assert await status(server.url) == 200
         while monotonic() < opened + 2.5:
             await page.read()
@@ -463,15 +464,16 @@ def test_interruption_reaches_the_pages_and_saves_the_film(session: Session) -> 
             raise KeyboardInterrupt
 
     async def steps() -> None:
-        server = Server(session, listen(0), "small.yaml")
-        session.start_film(Path("live.mp4"))
-        running = asyncio.create_task(server.run(pause))
-        client = await connect(server)
-        await client.until(lambda state: state["filming"] and state["time"] > 0.2)
-        interrupted.set()
-        while {"ended": True} not in client.texts:
-            await client.read()
-        await running
+        with Address(0) as address:
+            server = Server(session, address, "small.yaml")
+            session.start_film(Path("live.mp4"))
+            running = asyncio.create_task(server.run(pause))
+            client = await connect(server)
+            await client.until(lambda state: state["filming"] and state["time"] > 0.2)
+            interrupted.set()
+            while {"ended": True} not in client.texts:
+                await client.read()
+            await running
 
     with pytest.raises(KeyboardInterrupt):
         run(steps())
@@ -494,16 +496,17 @@ def test_interruption_drops_queued_saves(session: Session, message: Messages, mo
             raise KeyboardInterrupt
 
     async def steps() -> None:
-        server = Server(session, listen(0), "small.yaml", warn=lines.append)
-        running = asyncio.create_task(server.run(pause))
-        client = await connect(server)
-        await client.until(lambda state: True)
-        monkeypatch.setattr(Captures, "save_picture", save_picture)
-        for _ in range(count):
-            server.receive(server.pages[0], '["key", "p"]')
-        while {"ended": True} not in client.texts:
-            await client.read()
-        await running
+        with Address(0) as address:
+            server = Server(session, address, "small.yaml", warn=lines.append)
+            running = asyncio.create_task(server.run(pause))
+            client = await connect(server)
+            await client.until(lambda state: True)
+            monkeypatch.setattr(Captures, "save_picture", save_picture)
+            for _ in range(count):
+                server.receive(server.pages[0], '["key", "p"]')
+            while {"ended": True} not in client.texts:
+                await client.read()
+            await running
 
     with pytest.raises(KeyboardInterrupt):
         run(steps())
@@ -518,16 +521,17 @@ def test_interruption_drops_queued_saves(session: Session, message: Messages, mo
 
 @scenario
 async def test_page_quits(session: Session) -> None:
-    server = Server(session, listen(0), "small.yaml")
-    running = asyncio.create_task(server.run(lambda: None))
-    client = await connect(server)
-    await client.send("key", "q")
-    await asyncio.wait_for(running, WAIT_S)
+    with Address(0) as address:
+        server = Server(session, address, "small.yaml")
+        running = asyncio.create_task(server.run(lambda: None))
+        client = await connect(server)
+        await client.send("key", "q")
+        await asyncio.wait_for(running, WAIT_S)
 
 
 def test_port_in_use(small: Path, capsys: pytest.CaptureFixture[str], message: Messages) -> None:
-    with listen(0) as taken:
-        assert main(["view", "small.yaml", "--browser", "--port", str(taken.getsockname()[1])]) == 2
+    with Address(0) as taken:
+        assert main(["view", "small.yaml", "--browser", "--port", str(taken.port)]) == 2
     message(capsys.readouterr().err, hide=r"\d{4,}")
 
 
