@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from taichi_msm.cli import common, options
-from taichi_msm.cli.example import content, shipped_scenes, summary
+from taichi_msm.cli.example import scenes_folder, shipped_scenes, summary
 from taichi_msm.errors import FilesError, NotInstalledError, SceneError, printable, truncate
 from taichi_msm.system.process import Interruption, write_stderr
 
@@ -161,7 +161,7 @@ def _serve_scenes(
 
     interruption.listen()
     scenes, fault, wants_scenes = shipped_scenes(), "", True
-    summaries = {name: summary(path) for name, path in scenes.items() if "vary" not in content(path)}
+    summaries = {name: summary(path) for name, path in scenes.items() if path.parent == scenes_folder()}
     while wants_scenes:
         chosen = choose(address, summaries, interruption.raise_if_requested, lambda line: write_stderr([line]), fault)
         name = asyncio.run(chosen)
