@@ -25,8 +25,9 @@ from benchmarks.process import ROOT
 from taichi_msm import load_scene
 from taichi_msm.view.events import Drag, Press, Release
 from taichi_msm.view.recording import Captures
-from taichi_msm.view.server import Server, encode_jpeg, listen
+from taichi_msm.view.server import Server, encode_jpeg
 from taichi_msm.view.session import Session
+from taichi_msm.view.web import Address
 
 EVENTS = 200
 PARTS = 60
@@ -109,13 +110,14 @@ def main() -> None:
     scene = load_scene(ROOT / "scenes" / "press.yaml")
     with Session(scene, Captures(Path(tempfile.gettempdir()), "press.yaml")) as session:
         parts = measure_parts(session)
-        server = Server(session, listen(0), "press.yaml")
-        client = subprocess.Popen(
-            [sys.executable, "-m", "benchmarks.browser", server.url], cwd=ROOT, stdout=subprocess.PIPE, text=True
-        )
-        asyncio.run(server.run(lambda: None))
-        latencies, rate = json.loads(client.communicate()[0])
-        size = len(encode_jpeg(session.bare_picture()))
+        with Address(0) as address:
+            server = Server(session, address, "press.yaml")
+            client = subprocess.Popen(
+                [sys.executable, "-m", "benchmarks.browser", server.url], cwd=ROOT, stdout=subprocess.PIPE, text=True
+            )
+            asyncio.run(server.run(lambda: None))
+            latencies, rate = json.loads(client.communicate()[0])
+            size = len(encode_jpeg(session.bare_picture()))
     quantiles = statistics.quantiles(latencies, n=20)
     rows = {
         **{f"{part} (CPU time)": times for part, times in parts.items()},

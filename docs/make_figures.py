@@ -27,8 +27,9 @@ from taichi_msm.scene.camera import Camera
 from taichi_msm.sweeps.spec import load_sweep
 from taichi_msm.view.recording import Captures
 from taichi_msm.view.script import load_script, record_film, schedule_events
-from taichi_msm.view.server import Server, listen
+from taichi_msm.view.server import Server
 from taichi_msm.view.session import Session
+from taichi_msm.view.web import Address
 from tests.view.chromium import chromium
 
 Floats = NDArray[np.float64]
@@ -245,23 +246,24 @@ def page(width: int, height: int) -> None:
     """Save a screenshot of a session with the scene press, with a stiffer foundation at the end."""
 
     async def press(session: Session, folder: Path) -> None:
-        server = Server(session, listen(0), "scenes/press.yaml")
-        serving = asyncio.create_task(server.run(lambda: None))
-        async with chromium(folder / "profile") as tab:
-            await tab.open(server.url, width, height)
-            await tab.until("state !== null && state.time > 0.3")
-            for strength in (40, 70, 100):
-                await tab.value(f"send('strength', {strength}); send('press', 200, 300, false)")
-                await tab.until(f"state.time > {session.frame / session.frame_rate + 1.0}")
-                await tab.value("send('release')")
-                await tab.until(f"state.time > {session.frame / session.frame_rate + 0.5}")
-            await tab.value("send('press', 230, 310, false)")
-            await tab.until(f"state.time > {session.frame / session.frame_rate + 0.7}")
-            await tab.value("send('material', 'tissue.foundation', 4.5e5)")
-            await tab.until(f"state.time > {session.frame / session.frame_rate + 0.7}")
-            await tab.screenshot(folder / "page.png")
-        serving.cancel()
-        await asyncio.wait([serving])
+        with Address(0) as address:
+            server = Server(session, address, "scenes/press.yaml")
+            serving = asyncio.create_task(server.run(lambda: None))
+            async with chromium(folder / "profile") as tab:
+                await tab.open(server.url, width, height)
+                await tab.until("state !== null && state.time > 0.3")
+                for strength in (40, 70, 100):
+                    await tab.value(f"send('strength', {strength}); send('press', 200, 300, false)")
+                    await tab.until(f"state.time > {session.frame / session.frame_rate + 1.0}")
+                    await tab.value("send('release')")
+                    await tab.until(f"state.time > {session.frame / session.frame_rate + 0.5}")
+                await tab.value("send('press', 230, 310, false)")
+                await tab.until(f"state.time > {session.frame / session.frame_rate + 0.7}")
+                await tab.value("send('material', 'tissue.foundation', 4.5e5)")
+                await tab.until(f"state.time > {session.frame / session.frame_rate + 0.7}")
+                await tab.screenshot(folder / "page.png")
+            serving.cancel()
+            await asyncio.wait([serving])
 
     scene = load_scene(SCENES / "press.yaml", {"render.size": [720, 720], "render.supersample": 2})
     with tempfile.TemporaryDirectory() as directory, Session(scene, Captures(Path(directory), "press.yaml")) as session:

@@ -26,10 +26,9 @@ def example(name: str | None, directory: str) -> None:
     """List the shipped scenes, or write scene NAME, its pictures and its schema to DIR, by default this directory."""
     from taichi_msm.load.scene_file import schema
 
-    shipped = scenes_folder()
-    scenes = {path.stem: path for pattern in ("*.yaml", "sweeps/*.yaml") for path in sorted(shipped.glob(pattern))}
+    shipped, scenes = scenes_folder(), shipped_scenes()
     if name is None:
-        click.echo("\n".join(f"{scene:16}{_summary(path)}" for scene, path in scenes.items()))
+        click.echo("\n".join(f"{scene:16}{summary(path)}" for scene, path in scenes.items()))
         return
     if name not in scenes:
         message = f"{name} is not a shipped scene{did_you_mean(name, scenes)}; `taichi-msm example` lists them"
@@ -54,6 +53,13 @@ def scenes_folder() -> Path:
     return next(folder for folder in (package / "scenes", package.parent / "scenes") if folder.is_dir())
 
 
+def shipped_scenes() -> dict[str, Path]:
+    """Return the files of the shipped scenes and sweeps by name."""
+    return {
+        path.stem: path for pattern in ("*.yaml", "sweeps/*.yaml") for path in sorted(scenes_folder().glob(pattern))
+    }
+
+
 def _content(path: Path) -> Any:
     from taichi_msm.load.yaml_reader import read_yaml
 
@@ -70,7 +76,7 @@ def _with_schema(source: Path, path: Path) -> bytes:
     return comment.encode() + source.read_bytes()
 
 
-def _summary(path: Path) -> str:
+def summary(path: Path) -> str:
     """Return the first sentence of the comment at the head of a scene file."""
     lines = re.match("(#.*\n)+", path.read_text(encoding="utf-8"))
     return re.split(r"[:;] |(?<=[.?]) (?=[A-Z])", " ".join(lines[0].replace("#", "").split()))[0] if lines else ""

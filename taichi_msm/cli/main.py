@@ -9,7 +9,7 @@ from pathlib import Path
 
 import click
 
-from taichi_msm.cli import common, example, export, fit, options, palpation, run, study, sweep  # noqa: F401  # each registers its commands
+from taichi_msm.cli import common, example, export, fit, options, palpation, run, study, sweep, view  # noqa: F401  # each registers its commands
 from taichi_msm.errors import DivergedError, FilesError, MsmError, SceneError, out_of_memory
 from taichi_msm.system.process import discard_buffer, write_stderr
 

@@ -20,6 +20,7 @@ from taichi_msm.scene.render import PRESETS, Render
 from taichi_msm.scene.scene import Scene
 
 if TYPE_CHECKING:
+    from taichi_msm.render.config import DrawingConfig
     from taichi_msm.render.rasterizer import Rasterizer
 
 # A camera in any form that a scene accepts, the name of one of its cameras, a resolved `View`, or None for the scene's
@@ -73,12 +74,16 @@ class Renderer:
         return view(self.scene.model_copy(update={"render": single_camera, "sheet": sheet, "output": ()}), time)
 
     def draw(self, shot: Shot, style: Render | None = None) -> NDArray[np.uint8]:
-        """Draw a picture, shape (height, width, 3); `style` may differ from the scene in `shading` and `wireframe`."""
+        """Draw a picture, shape (height, width, 3); `style` may differ from the scene.
+
+        It differs in `shading`, `wireframe` and, with a view of that size, `size`; one other size is kept.
+        """
         return self._rasterizer(style, picture=True, view=shot.view).draw(*shot)
 
     def is_compiled(self, style: Render, view: View) -> bool:
         """Return whether the kernel of `draw` is compiled already."""
-        return self._key(style, picture=True, view=view) in self._rasterizers
+        config = self._config(style, picture=True, view=view)
+        return any(rasterizer.config == config for rasterizer in self._rasterizers.values())
 
     def kernels(self) -> tuple[object, ...]:
         """Return the compile-time settings of all kernels of `observe`, as a cache key."""
@@ -161,17 +166,29 @@ class Renderer:
     ) -> Rasterizer:
         key = self._key(style or self.scene.render, picture=picture, labels=labels, view=view)
         if key not in self._rasterizers:
-            from taichi_msm.render.rasterizer import Rasterizer, drawing_config
+            from taichi_msm.render.rasterizer import Rasterizer
 
-            scene, sheet = self.scene, self.scene.sheet.with_kept_frame()
-            scene = scene if style is None else scene.model_copy(update={"render": style, "sheet": sheet})
             texture = np.zeros((1, 1, 3), np.uint8)
             if picture:
                 texture = self._texture = load_texture(self.scene) if self._texture is None else self._texture
-            config = drawing_config(scene, picture=picture, labels=labels, lens=view.lens_model)
-            self._rasterizers[key] = Rasterizer(scene, texture, config)
+            config = self._config(style, picture=picture, labels=labels, view=view)
+            kept_sizes = key[-1], self.scene.render.size
+            self._rasterizers = {each: kept for each, kept in self._rasterizers.items() if each[-1] in kept_sizes}
+            self._rasterizers[key] = Rasterizer(self._styled(style), texture, config)
         return self._rasterizers[key]
+
+    def _config(
+        self, style: Render | None, *, picture: bool, labels: Collection[str] = (), view: View
+    ) -> DrawingConfig:
+        from taichi_msm.render.rasterizer import drawing_config
+
+        return drawing_config(self._styled(style), picture=picture, labels=labels, lens=view.lens_model)
+
+    def _styled(self, style: Render | None) -> Scene:
+        """Return the scene with other drawing settings, which do not change its surface."""
+        sheet = self.scene.sheet.with_kept_frame()
+        return self.scene if style is None else self.scene.model_copy(update={"render": style, "sheet": sheet})
 
     def _key(self, style: Render, *, picture: bool, labels: Collection[str] = (), view: View) -> tuple[object, ...]:
         """Return the cache key of a rasteriser: all settings that differ among the rasterisers of a scene."""
-        return picture, frozenset(labels), view.optics, style.shading, style.wireframe, self.scene.shapes
+        return picture, frozenset(labels), view.optics, style.shading, style.wireframe, self.scene.shapes, style.size

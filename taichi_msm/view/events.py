@@ -1,6 +1,7 @@
-"""Input events of a session, with positions in pixels: x right, y down, (0, 0) at the centre of the upper left pixel.
+"""Messages of a page: input events of the session, and messages for the server.
 
-A page sends an event as a JSON list of its name and its values, such as `["press", 256, 250, false]`.
+A page sends a message as a JSON list of its name and its values, such as `["press", 256, 250, false]` or `["shown"]`.
+Positions are in pixels of the scene's picture: x right, y down, (0, 0) at the centre of the upper left pixel.
 """
 
 from __future__ import annotations
@@ -15,9 +16,6 @@ from taichi_msm.view.material import MATERIAL
 # Limits of a message of a page: its size [bytes], and the absolute value of its numbers.
 MAX_BYTES = 512
 MAX_VALUE = 1e12
-
-# Message with which a page acknowledges a picture.
-SHOWN = ["shown"]
 
 
 class Hover(NamedTuple):
@@ -80,6 +78,34 @@ class Material(NamedTuple):
 
 Event = Hover | Press | Drag | Release | Turn | Strength | StrengthChange | Key | Material
 
+
+class Shown(NamedTuple):
+    """The page has shown a picture."""
+
+
+class Width(NamedTuple):
+    """The page shows the picture with this width [px of its screen]."""
+
+    pixels: float
+
+
+class TakeOver(NamedTuple):
+    """A watching page asks to steer."""
+
+
+class Answer(NamedTuple):
+    """The steering page gives the tool to the page that asks, or refuses."""
+
+    gives: bool
+
+
+class Scenes(NamedTuple):
+    """The page leaves the session for the list of scenes."""
+
+
+# Messages for the server.
+Request = Shown | Width | TakeOver | Answer | Scenes
+
 QUIT = Key("q")
 
 # Switching the tool may compile another kernel.
@@ -118,22 +144,17 @@ KEYS = {
     "q": "quit",
 }
 
-_EVENTS: dict[str, TypeAdapter[Event]] = {
+_EVENTS: dict[str, TypeAdapter[Event | Request]] = {
     kind.__name__.lower(): TypeAdapter(kind, config=ConfigDict(strict=True, allow_inf_nan=False))
-    for kind in get_args(Event)
+    for kind in (*get_args(Event), *get_args(Request))
 }
 
 
-def parse_message(message: str | bytes) -> Event | None:
-    """Parse a message of a page, a JSON list of the name of an event and its values; return None for `SHOWN`.
-
-    The ValueError of an invalid message has the event and the reason.
-    """
+def parse_message(message: str | bytes) -> Event | Request:
+    """Parse a message of a page; the ValueError of an invalid one has its name and the reason."""
     values: Any = json.loads(message)
-    if values == SHOWN:
-        return None
     if not (isinstance(values, list) and values and isinstance(values[0], str) and values[0] in _EVENTS):
-        raise ValueError(f"not a list of an event and its values; the events are {', '.join(_EVENTS)}")
+        raise ValueError(f"not a list of a message's name and its values; the names are {', '.join(_EVENTS)}")
     if any(isinstance(value, (int, float)) and not abs(value) <= MAX_VALUE for value in values):
         raise ValueError(f"{values[0]}: a value is not from {-MAX_VALUE:g} to {MAX_VALUE:g}")
     try:

@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 import filecmp
+import io
 import os
 import shutil
+from collections.abc import Sequence
 from contextlib import ExitStack, closing
 from pathlib import Path
 from typing import Any
+from zipfile import ZipFile
 
 import yaml
 from PIL import Image
@@ -68,6 +71,8 @@ class Captures:
     def __init__(self, folder: Path, name: str) -> None:
         self.folder = folder
         self.saved: list[Path] = []  # in order
+        # Files of each download, in order: one, or those of a ZIP, a scene and its pictures.
+        self.downloads: dict[str, list[Path]] = {}
         self._name = name  # of the scene, for a comment in saved scenes
 
     def save_picture(self, picture: Picture) -> Path:
@@ -79,7 +84,13 @@ class Captures:
     def save_scene(self, scene: Scene) -> Path:
         """Save a scene and copies of its pictures; return the path of the scene file."""
         with writing(self.folder), hidden_folder(self.folder) as hidden:
-            scene = scene.with_pictures(lambda path: self._copy_picture(Path(path)).name)
+            pictures: list[Path] = []
+
+            def copy(path: str) -> str:
+                pictures.append(self._copy_picture(Path(path)))
+                return pictures[-1].name
+
+            scene = scene.with_pictures(copy)
             data = scene.model_dump(mode="json", exclude_none=True)
             style: dict[str, Any] = {"sort_keys": False, "default_flow_style": None, "width": 120}
             # The C emitter is ten times faster, with the same output.
@@ -90,19 +101,33 @@ class Captures:
             if len(text.encode()) > MAX_BYTES or count_probe_values(scene) + 1000 > MAX_NODES:
                 raise FilesError("this session is too long for a scene file; reset it (r), and record a shorter one")
             (hidden / "session").write_text(text, "utf-8")
-            return self._move_to_free_name(hidden / "session", "session", ".yaml")
+            return self._move_to_free_name(hidden / "session", "session", ".yaml", pictures)
 
     def save_film(self, film: Film, path: Path | None = None) -> Path:
         """Finish and save a film with at least one picture at a path, by default a free name; return the path."""
         with closing(film), writing(path or self.folder):
             if path is None:
                 return self._move_to_free_name(film.finish(), "film", ".gif")
-            self.saved.append(film.finish().replace(path))
-            return path
+            return self._add(film.finish().replace(path))
 
-    def _move_to_free_name(self, draft: Path, stem: str, suffix: str) -> Path:
-        self.saved.append(move_to_free_name(draft, self.folder, stem, suffix))
-        return self.saved[-1]
+    def read_download(self, name: str) -> bytes:
+        """Read the content of a download; raise a FilesError if a file has gone."""
+        paths, packed = self.downloads[name], io.BytesIO()
+        with writing(self.folder):
+            if len(paths) == 1:
+                return paths[0].read_bytes()
+            with ZipFile(packed, "w") as archive:
+                for path in paths:
+                    archive.write(path, path.name)
+        return packed.getvalue()
+
+    def _move_to_free_name(self, draft: Path, stem: str, suffix: str, pictures: Sequence[Path] = ()) -> Path:
+        return self._add(move_to_free_name(draft, self.folder, stem, suffix), pictures)
+
+    def _add(self, path: Path, pictures: Sequence[Path] = ()) -> Path:
+        self.saved.append(path)
+        self.downloads[f"{path.stem}.zip" if pictures else path.name] = [path, *dict.fromkeys(pictures)]
+        return path
 
     def _copy_picture(self, image: Path) -> Path:
         """Copy a picture to the folder unless an equal copy is there; return its path."""

@@ -1,66 +1,51 @@
-"""A session in browsers: a server sends pictures and readings, and receives events, on the loopback interface only.
+"""A session in browsers: a server sends pictures and readings, and receives the messages of `events`.
 
-Server and session share a thread, because Taichi holds Python's global lock while a kernel runs. Decision 0032 explains
-the choice of Tornado.
+Server and session share a thread, because Taichi holds Python's global lock while a kernel runs.
+
+A picture is a binary message: the length of a header in 4 bytes, the header, and a JPEG, which is missing if the
+picture has not changed. The header is JSON: the state of the session (`Server._state`), whether the page steers, asks
+to steer or was refused, whether another page asks, and the readings since the last picture. Texts are JSON as well: a
+description of the session at the start, notices before the session blocks, errors of messages, and the end.
 """
 
 from __future__ import annotations
 
 import asyncio
-import errno
-import hmac
 import io
 import json
 import secrets
-import socket
 import time
 from collections import deque
-from collections.abc import Callable, Collection, Iterator
-from importlib.resources import files
-from typing import Any, cast
+from collections.abc import Callable, Iterator
+from typing import Any
 
 import numpy as np
 from PIL import Image
-from tornado.http1connection import HTTP1ServerConnection
-from tornado.httpserver import HTTPServer
-from tornado.httputil import HTTPServerRequest
-from tornado.ioloop import IOLoop
-from tornado.iostream import IOStream
-from tornado.web import Application, HTTPError, RequestHandler
+from tornado.web import HTTPError
 from tornado.websocket import WebSocketClosedError, WebSocketHandler
 
-from taichi_msm.errors import DeviceError, FilesError, Pause
+from taichi_msm.errors import FilesError, Pause
 from taichi_msm.runs.media import Picture
 from taichi_msm.view import events
 from taichi_msm.view.material import MATERIAL, MAX_FACTOR
-from taichi_msm.view.origin import parse_origin
+from taichi_msm.view.resolution import Resolution
 from taichi_msm.view.session import Session
 from taichi_msm.view.tools import PositionControlledTool
-
-ADDRESS = "127.0.0.1"
-
-# Media types by the path of a request after the token, which is the name of a file; empty for index.html.
-PAGE = {"": "text/html", "style.css": "text/css", "view.js": "text/javascript"}
-
-HEADERS = {
-    "Cache-Control": "no-store",
-    "Content-Security-Policy": "default-src 'none'; script-src 'self'; style-src 'self'; img-src data:; "
-    "connect-src 'self'; frame-ancestors 'self'",
-    "Referrer-Policy": "no-referrer",
-    "Server": "taichi-msm",
-    "X-Content-Type-Options": "nosniff",
-}
+from taichi_msm.view.web import Address, Guarded, PageFile, serving
 
 # Largest number of unacknowledged pictures of a page, which limits the lag of a slow connection.
 MAX_UNREAD_PICTURES = 3
 
 MAX_PAGES = 16
 
-# Largest number of open connections, including pages.
-MAX_CONNECTIONS = 64
+# Time in which a reloaded page that steered gets the tool back [s].
+RETURN_S = 10.0
 
-# Longest duration of a connection that is not a page's [s].
-MAX_REQUEST_S = 10.0
+# Time in which the steering page can refuse to give the tool away [s].
+ANSWER_S = 5.0
+
+# Number of readings that the plots of a new page show, a minute at 50 frames per second.
+MAX_READINGS = 3000
 
 # Largest number of events that wait to be handled.
 MAX_EVENTS = 500
@@ -80,85 +65,68 @@ MAX_DELAY_S = 0.1
 # Longest time of stepping, and of handling events, between two pictures, even if more are due [s].
 MAX_STEPPING_S = 0.03
 
+# Number of saved files that pages list.
+SHOWN_DOWNLOADS = 4
+
 # Events that save a file.
 SAVES = (events.Key("p"), events.Key("w"))
-
-
-def listen(port: int) -> socket.socket:
-    """Return a listening, non-blocking socket at a port of the loopback interface; 0 for a free port."""
-    try:
-        listener = socket.create_server((ADDRESS, port))
-    except OSError as error:
-        reason = "is in use" if error.errno == errno.EADDRINUSE else f"cannot be used ({error.strerror})"
-        raise DeviceError(f"--port {port}: {reason}; take another, or leave --port out for a free one") from None
-    listener.setblocking(False)
-    return listener
 
 
 class Server:
     """Server of a session to pages in browsers. The page that has been open longest steers; the others watch.
 
-    `origins` are those of pages behind a proxy; origins of the loopback interface are always permitted. `warn` receives
-    lines for the user.
+    A page that asks to steer does so after `ANSWER_S`, unless the steering page refuses, which it can once per page.
+    `warn` receives lines for the user. With `has_scenes`, pages can leave the session for another scene.
     """
 
     def __init__(
         self,
         session: Session,
-        listener: socket.socket,
+        address: Address,
         title: str,
-        origins: Collection[str] = (),
         warn: Callable[[str], None] = lambda line: None,
+        *,
+        has_scenes: bool = False,
     ) -> None:
-        self._session, self._listener, self._title, self._warn = session, listener, title, warn
-        self._origins = {parse_origin(origin) for origin in origins}
-        self._port, self._token = listener.getsockname()[1], secrets.token_urlsafe(24)
-        self.url = f"http://{ADDRESS}:{self._port}/{self._token}/"
+        self._session, self._address, self._title, self._warn = session, address, title, warn
+        self._has_scenes, self.url = has_scenes, address.url
         self.pages: list[_Connection] = []  # the first one steers
-        self._events: deque[events.Event] = deque()
+        # Page that asks to steer, and the end of the time for an answer [s].
+        self._asking: _Connection | None = None
+        self._answer_end = 0.0
+        # Name of the page that steered and was closed, and the end of the time in which it gets the tool back [s].
+        self._closed, self._return_end = "", 0.0
+        self._events: deque[events.Event | events.Scenes] = deque()
         self._handled = 0
+        # Readings since the last reset.
+        self._readings: deque[list[float]] = deque(maxlen=MAX_READINGS)
+        self._resolution = Resolution(session.viewport.render.size)
         # Last picture, as drawn and as JPEG.
         self._picture: Picture | None = None
         self._jpeg = b""
 
-    async def run(self, pause: Pause) -> None:
-        """Serve the session until the page that steers quits; `pause` is called before every picture."""
-        handlers: list[Any] = [(r"/[^/]+/socket", _Connection, {"server": self}), (r".*", _Page, {"server": self})]
-        application = Application(
-            handlers,
-            log_function=lambda handler: None,
-            websocket_max_message_size=events.MAX_BYTES,
-            websocket_ping_interval=20,
-        )
-        http = _BoundedServer(application, max_body_size=events.MAX_BYTES)
-        http.warn = self._warn
-        http.add_socket(self._listener)
-        try:
-            await self._run(pause)
-        finally:
-            http.stop()
+    async def run(self, pause: Pause) -> bool:
+        """Serve the session until the page that steers quits; return whether it wants another scene.
+
+        `pause` is called before every picture.
+        """
+        address, wants_scenes = {"address": self._address}, False
+        handlers = [
+            (r"/[^/]+/socket", _Connection, {**address, "server": self}),
+            (r"/[^/]+/saved/(.+)", _Download, {**address, "session": self._session}),
+            (r".*", PageFile, address),
+        ]
+
+        def close() -> None:
             if dropped := sum(event in SAVES for event in self._events):
                 self._warn(f"{dropped} queued saves were dropped")
             for page in self.pages:
-                page.send(json.dumps({"ended": True}))
+                page.send(json.dumps({"scenes" if wants_scenes else "ended": True}))
                 page.close(1001)
-            await asyncio.sleep(0.1)  # The pages receive the message.
-            await http.close_all_connections()
 
-    def permits(self, request: HTTPServerRequest) -> bool:
-        """Return whether a request has the token, and no origin or a permitted one."""
-        token = request.path.lstrip("/").partition("/")[0]
-        header = request.headers.get("Origin")
-        is_permitted = header is None or self._permits_origin(header, request.host)
-        return hmac.compare_digest(token.encode("utf-8", "replace"), self._token.encode()) and is_permitted
-
-    def _permits_origin(self, header: str, host: str) -> bool:
-        """Return whether an origin is permitted, this server, or a loopback port that `ssh -L` forwards to it."""
-        origin, forwarded = parse_origin(header), parse_origin(f"http://{host}")
-        if origin is None:
-            return False
-        is_loopback = origin.scheme == "http" and origin.host in {ADDRESS, "localhost", "[::1]"}
-        return origin in self._origins or (is_loopback and origin.port in (self._port, forwarded and forwarded.port))
+        async with serving(self._address, handlers, self._warn, close):
+            wants_scenes = await self._run(pause)
+        return wants_scenes
 
     def connect(self, page: _Connection) -> None:
         """Add a page, and send it a description of the session."""
@@ -167,7 +135,11 @@ class Server:
             {"key": key, "name": MATERIAL[key][0], "unit": MATERIAL[key][1], "initial": initial}
             for key, (_, initial) in session.material().items()
         ]
-        self.pages.append(page)
+        if page.name == self._closed and time.perf_counter() < self._return_end:
+            self._give(page)
+        else:
+            self.pages.append(page)
+        page.readings.extend(self._readings)
         description = {
             "title": self._title,
             "size": session.viewport.render.size,
@@ -175,6 +147,7 @@ class Server:
             "material": material,
             "max_factor": MAX_FACTOR,
             "keys": events.POINTER | events.KEYS,
+            "has_scenes": self._has_scenes,
         }
         page.send(json.dumps(description))
 
@@ -182,14 +155,26 @@ class Server:
         """Remove a page, if present; if it steered, release the tool and let the next page steer."""
         if page not in self.pages:
             return
-        if page is self.pages[0]:
-            self._events.append(events.Release())
+        steered = page is self.pages[0]
         self.pages.remove(page)
+        if page is self._asking:
+            self._asking = None
+        if steered and self._asking:
+            self._give(self._asking)
+        elif steered:
+            self._events.append(events.Release())
+            self._closed, self._return_end = page.name, time.perf_counter() + RETURN_S
+
+    def _give(self, page: _Connection) -> None:
+        """Release the tool, and let a page steer."""
+        self._events.append(events.Release())
+        self.pages = [page, *(each for each in self.pages if each is not page)]
+        self._asking, self._return_end, page.was_refused = None, 0.0, False
 
     def receive(self, page: _Connection, message: str | bytes) -> None:
-        """Queue the event of a message if its page steers; reply to an invalid message with its error."""
+        """Handle a message of a page, or queue its event if it steers; reply to an invalid message with its error."""
         try:
-            event = events.parse_message(message)
+            parsed = events.parse_message(message)
         except (ValueError, RecursionError) as error:
             page.invalid += 1
             if page.invalid < MAX_INVALID_MESSAGES:
@@ -197,19 +182,40 @@ class Server:
             else:
                 self._reject(page, "too many invalid messages")
             return
-        if event is None:
-            page.unread = max(0, page.unread - 1)
-        elif page is self.pages[0]:
-            if len(self._events) < MAX_EVENTS:
-                self._events.append(event)
-            else:
+        steers = page is self.pages[0]
+        match parsed:
+            case events.Shown():
+                page.unread = max(0, page.unread - 1)
+            case events.Width(pixels):
+                page.width = pixels
+            case events.TakeOver():
+                self._ask(page)
+            case events.Answer(gives):
+                if steers and self._asking:
+                    self._answer(self._asking, gives)
+            case _ if steers and len(self._events) >= MAX_EVENTS:
                 self._reject(page, "too many events")
+            case _ if steers:
+                self._events.append(parsed)
+
+    def _ask(self, page: _Connection) -> None:
+        """Ask the steering page to give the tool to a page; if it has refused before, do not ask."""
+        if page.was_refused:
+            self._give(page)
+        elif self._asking is None and page is not self.pages[0]:
+            self._asking, self._answer_end = page, time.perf_counter() + ANSWER_S
+
+    def _answer(self, asking: _Connection, gives: bool) -> None:
+        if gives:
+            self._give(asking)
+        else:
+            asking.was_refused, self._asking = True, None
 
     def _reject(self, page: _Connection, reason: str) -> None:
         page.close(1008, reason)
         self.disconnect(page)
 
-    async def _run(self, pause: Pause) -> None:
+    async def _run(self, pause: Pause) -> bool:
         session = self._session
         pacing = Pacing(session.frame_rate, time.perf_counter)
         while True:
@@ -218,8 +224,12 @@ class Server:
             end = time.perf_counter() + MAX_STEPPING_S
             while self._events and time.perf_counter() < end:
                 event = self._events.popleft()
+                if isinstance(event, events.Scenes):
+                    if self._has_scenes:
+                        return True
+                    continue
                 if event == events.QUIT:
-                    return
+                    return False
                 if event == events.SWITCH_TOOL:
                     await self._announce(events.COMPILING)
                 try:
@@ -230,33 +240,49 @@ class Server:
                 self._handled += 1
             if not self.pages:
                 continue
+            if self._asking and time.perf_counter() > self._answer_end:
+                self._give(self._asking)
             for _ in pacing.due_frames():
                 self._advance()
             if not session.viewport.is_compiled:
                 await self._announce(events.COMPILING)
-            self._show(pacing.status())
+            self._show(*pacing.speed())
 
     def _advance(self) -> None:
         """Advance the session by a frame, and queue its readings for every page."""
         session, before = self._session, self._session.frame
         session.advance()
         if session.frame != before:
-            time_s = session.frame / session.frame_rate
-            reading = [float(f"{value:.5g}") for value in (time_s, session.tool_force(), session.depth())]
+            values = [float(f"{value:.5g}") for value in (session.tool_force(), session.depth())]
+            reading = [round(session.frame / session.frame_rate, 6), *values]
+            if before == 0:
+                self._readings.clear()
+            self._readings.append(reading)
             for page in self.pages:
                 page.readings.append(reading)
 
-    def _show(self, pacing: str) -> None:
+    def _show(self, rate: float, speed: float) -> None:
         """Send the state, and the picture if it changed, to every page that reads its pictures."""
         ready = [page for page in self.pages if page.unread < MAX_UNREAD_PICTURES and page.unsent == 0]
         if not (ready or self._session.filming):
             return
-        picture = self._session.bare_picture()
+        self._resolution.set_width(self.pages[0].width)
+        start = time.perf_counter()
+        picture = self._session.bare_picture(self._resolution.size)
         if self._picture is None or not np.array_equal(picture, self._picture):
             self._picture, self._jpeg = picture, encode_jpeg(picture)
-        state = self._state(pacing)
+            if not self._session.filming:
+                self._resolution.measure(time.perf_counter() - start, self._session.load)
+        state = {**self._state(), "rate": round(rate), "speed": round(speed, 2)}
         for page in ready:
-            page_state = {"steers": page is self.pages[0], "readings": list(page.readings)}
+            steers = page is self.pages[0]
+            page_state = {
+                "steers": steers,
+                "is_asked": steers and self._asking is not None,
+                "asks": page is self._asking,
+                "was_refused": page.was_refused,
+                "readings": list(page.readings),
+            }
             header = json.dumps({**state, **page_state}, allow_nan=False).encode()
             jpeg = b"" if page.jpeg is self._jpeg else self._jpeg
             page.send(len(header).to_bytes(4, "big") + header + jpeg)
@@ -264,7 +290,7 @@ class Server:
             page.unread += 1
             page.readings.clear()
 
-    def _state(self, pacing: str) -> dict[str, Any]:
+    def _state(self) -> dict[str, Any]:
         session, tool = self._session, self._session.tool
         return {
             "handled": self._handled,
@@ -277,7 +303,7 @@ class Server:
             "light": session.viewport.render.shading != "none",
             "mesh": session.viewport.render.wireframe,
             "notice": session.notice,
-            "pacing": pacing,
+            "saved": list(session.captures.downloads)[-SHOWN_DOWNLOADS:],
             "material": {key: current for key, (current, _) in session.material().items()},
         }
 
@@ -314,15 +340,14 @@ class Pacing:
         while start - self._pictures[0][0] > 1.0:
             self._pictures.popleft()
 
-    def status(self) -> str:
-        """Format the rate of pictures, and the speed if it is below 95 % of real time."""
+    def speed(self) -> tuple[float, float]:
+        """Return pictures per second, and simulated per real time; both are 0 at the start."""
         if len(self._pictures) < 2:
-            return ""
+            return 0.0, 0.0
         seconds = self._pictures[-1][0] - self._pictures[0][0]
-        rate = f"{(len(self._pictures) - 1) / seconds:.0f} pictures/s"
         # The last picture is excluded, as its duration is not known yet.
-        speed = sum(count for _, count in list(self._pictures)[:-1]) / self._rate / seconds
-        return rate if speed >= 0.95 else f"{rate}  ·  too slow: {speed:.2f} x real time"
+        frames = sum(count for _, count in list(self._pictures)[:-1])
+        return (len(self._pictures) - 1) / seconds, frames / self._rate / seconds
 
 
 def encode_jpeg(picture: Picture) -> bytes:
@@ -333,78 +358,34 @@ def encode_jpeg(picture: Picture) -> bytes:
     return file.getvalue()
 
 
-class _BoundedServer(HTTPServer):
-    """HTTP server with at most `MAX_CONNECTIONS`, which closes those without a page after `MAX_REQUEST_S`."""
+class _Download(Guarded):
+    """Handler of the files that the session has saved."""
 
-    # Called with a line when the first connection is refused.
-    warn: Callable[[str], None]
+    def initialize(self, address: Address, session: Session) -> None:  # type: ignore[override]
+        super().initialize(address)
+        self.captures = session.captures
 
-    def __init__(self, *arguments: Any, **options: Any) -> None:
-        super().__init__(*arguments, **options)
-        # All connections, some closed, and the deadlines of those that are not a page's.
-        self._streams: list[IOStream] = []
-        self._deadlines: dict[IOStream, object] = {}
-        self._has_warned = False
-
-    def handle_stream(self, stream: IOStream, address: tuple[Any, ...]) -> None:
-        """Serve a connection, or close it at once."""
-        self._streams = [each for each in self._streams if not each.closed()]
-        if len(self._streams) < MAX_CONNECTIONS:
-            self._streams.append(stream)
-            self._deadlines[stream] = IOLoop.current().call_later(MAX_REQUEST_S, stream.close)
-            super().handle_stream(stream, address)
-            return
-        stream.close()
-        if not self._has_warned:
-            self._has_warned = True
-            limit = f"further ones are refused; those without a page end after {MAX_REQUEST_S:g} s"
-            self.warn(f"{MAX_CONNECTIONS} connections are open, {limit}")
-
-    def on_close(self, server_conn: object) -> None:
-        """Remove the deadline of a connection that has closed or become a page's."""
-        super().on_close(server_conn)
-        IOLoop.current().remove_timeout(self._deadlines.pop(cast(HTTP1ServerConnection, server_conn).stream))
-
-    async def close_all_connections(self) -> None:
-        """Close all connections, also those of pages."""
-        for stream in self._streams:
-            stream.close()
-        await super().close_all_connections()
-
-
-class _Guarded(RequestHandler):
-    """Handler that rejects requests without permission."""
-
-    def initialize(self, server: Server) -> None:
-        self.server = server
-
-    def prepare(self) -> None:
-        if not self.server.permits(self.request):
-            raise HTTPError(403)
-
-    def set_default_headers(self) -> None:
-        for name, value in HEADERS.items():
-            self.set_header(name, value)
-
-
-class _Page(_Guarded):
-    """Handler of the page's files."""
-
-    def get(self) -> None:
-        token, slash, name = self.request.path.lstrip("/").partition("/")
-        if not slash:
-            self.redirect(f"{token}/")
-            return
-        if name not in PAGE:
+    def get(self, name: str) -> None:
+        if name not in self.captures.downloads:
             raise HTTPError(404)
-        self.set_header("Content-Type", f"{PAGE[name]}; charset=utf-8")
-        self.write((files("taichi_msm.view") / "page" / (name or "index.html")).read_bytes())
+        try:
+            content = self.captures.read_download(name)
+        except FilesError:
+            raise HTTPError(404) from None
+        self.settings["lift_deadline"](self.request)
+        self.set_header("Connection", "close")
+        self.set_header("Content-Type", "application/octet-stream")
+        self.set_header("Content-Disposition", "attachment")
+        self.write(content)
 
 
-class _Connection(_Guarded, WebSocketHandler):
+class _Connection(Guarded, WebSocketHandler):
     """Connection of a page.
 
     Attributes:
+        name: random name that a page keeps when it is reloaded.
+        width: width of the picture on the page's screen [px].
+        was_refused: whether the steering page has refused to give it the tool.
         unread: number of sent pictures that the page has not acknowledged.
         unsent: number of messages that wait for the page to read.
         invalid: number of invalid messages of the page.
@@ -412,9 +393,15 @@ class _Connection(_Guarded, WebSocketHandler):
         jpeg: last picture sent to the page.
     """
 
+    def initialize(self, address: Address, server: Server) -> None:  # type: ignore[override]
+        super().initialize(address)
+        self.server = server
+
     def open(self) -> None:
+        self.name = self.get_query_argument("name", secrets.token_urlsafe(8))
+        self.width, self.was_refused = 0.0, False
         self.unread = self.unsent = self.invalid = 0
-        self.readings: deque[list[float]] = deque(maxlen=1000)
+        self.readings: deque[list[float]] = deque(maxlen=MAX_READINGS)
         self.jpeg = b""
         self.set_nodelay(True)
         if len(self.server.pages) < MAX_PAGES:

@@ -90,7 +90,7 @@ class Session(AbstractContextManager["Session"]):
         live, self.subframes = divide_frames(check_scene(scene))
         plan = resolve(live, device, lambda done, total: progress("pilot")).plan
         scene = plan.scene
-        self._captures = captures
+        self.captures = captures
         self._film: Film | None = None
         self._film_path: Path | None = None
         self._scene_probes = tuple(probe for probe in scene.probes if play or probe.clamp is not None)
@@ -230,13 +230,18 @@ class Session(AbstractContextManager["Session"]):
         self._frame_time_s += weight * (duration - self._frame_time_s)
 
     @property
+    def load(self) -> float:
+        """Time of stepping per simulated time."""
+        return self._frame_time_s * self.frame_rate
+
+    @property
     def filming(self) -> bool:
         """Whether a film is running."""
         return self._film is not None
 
     def start_film(self, path: Path | None = None) -> None:
         """Start a film, which is saved when it ends, by default under a free name in the folder of captures."""
-        file, option = (self._captures.folder / "film.gif", "--out") if path is None else (path, "--record")
+        file, option = (self.captures.folder / "film.gif", "--out") if path is None else (path, "--record")
         self._film = Film(file, option, self.scene.render, self.frame_rate, self.subframes, self._elapsed)
         self._film_path = path
         if path is not None:
@@ -254,13 +259,17 @@ class Session(AbstractContextManager["Session"]):
         overlay.write_text(picture, above, self.notice, keys, bar)
         return picture
 
-    def bare_picture(self) -> Picture:
-        """Draw a picture with a ring at a tool without an instrument; a running film gets it, too."""
-        picture = self._draw()
+    def bare_picture(self, size: tuple[int, int] | None = None) -> Picture:
+        """Draw a picture with a ring at a tool without an instrument; a running film gets it, too.
+
+        Without a film, the picture may have another size of the same aspect, (width, height) [px].
+        """
+        picture = self._draw(None if self.filming else size)
         tool = self.tool
         has_ring = isinstance(tool, ForceControlledTool) and tool.percent != 0 and tool.probe.instrument is None
         if has_ring and (pixel := self.viewport.project(self._touched_point())):
-            overlay.mark_tool(picture, pixel, pulls=self._pulls)
+            factor = picture.shape[0] / self.scene.render.size[1]
+            overlay.mark_tool(picture, (factor * pixel[0], factor * pixel[1]), pulls=self._pulls)
         if self._film is not None:
             try:
                 self._film.add_frame(picture, self._elapsed)
@@ -287,14 +296,17 @@ class Session(AbstractContextManager["Session"]):
     def __exit__(self, *_: object) -> None:
         self.close()
 
-    def _draw(self) -> Picture:
-        """Draw the tissue and the instruments; an idle force-controlled tool is drawn at the pointer."""
+    def _draw(self, size: tuple[int, int] | None = None) -> Picture:
+        """Draw the tissue and the instruments; an idle force-controlled tool is drawn at the pointer.
+
+        `size` is width and height of the picture [px], by default those of the scene.
+        """
         positions, scene = self.positions(), self._simulation.scene
         instruments = place_instruments(scene, positions, self._simulation.time)
         instrument = scene.probes[-1].instrument
         if instrument is not None and (position := self._hover_position()):
             instruments[-1] = place_instrument(instrument, scene, positions, self._coordinates(position))
-        return self.viewport.draw(positions, instruments)
+        return self.viewport.draw(positions, instruments, size)
 
     def _coordinates(self, position: SheetPosition) -> NDArray[np.float64]:
         """Return the coordinates at rest of a position, see `Rest`, shape (2,)."""
@@ -385,7 +397,7 @@ class Session(AbstractContextManager["Session"]):
             case "f":
                 self._switch()
             case "p":
-                self.show_notice(f"saved {self._captures.save_picture(self._draw())}")
+                self.show_notice(f"saved {self.captures.save_picture(self._draw())}")
             case "g":
                 if self._film is None:
                     self.start_film()
@@ -394,7 +406,7 @@ class Session(AbstractContextManager["Session"]):
             case "w" if self._material_changed:
                 raise SceneError(["a scene cannot contain a changed material: reset (r) and repeat the session"])
             case "w":
-                self.show_notice(f"saved {self._captures.save_scene(self.recorded_scene())}")
+                self.show_notice(f"saved {self.captures.save_scene(self.recorded_scene())}")
             case "i":
                 self._show_readings = not self._show_readings
             case "h":
@@ -447,7 +459,7 @@ class Session(AbstractContextManager["Session"]):
         if film is None:
             return
         if film.pictures > 0:
-            self.show_notice(f"saved {self._captures.save_film(film, self._film_path)}")
+            self.show_notice(f"saved {self.captures.save_film(film, self._film_path)}")
         else:
             film.close()
             self.show_notice("no film was saved: it had no picture yet")
@@ -462,7 +474,7 @@ class Session(AbstractContextManager["Session"]):
         return bool(self.tool.percent * (force @ self._normal()) > 0)
 
     def _reading_lines(self) -> list[str]:
-        speed = f"steps {1 / self.frame_rate / self._frame_time_s:.2g} x real time" if self._frame_time_s > 0 else ""
+        speed = f"steps {1 / self.load:.2g} x real time" if self.load > 0 else ""
         state = [speed, "paused" if self.paused else "", "film" if self.filming else ""]
         return ["  ·  ".join(filter(None, line)) for line in (self._tool_readings(), state)]
 

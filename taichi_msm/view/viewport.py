@@ -78,9 +78,17 @@ class Viewport:
         """Show or hide the mesh."""
         self.render = self.render.model_copy(update={"wireframe": not self.render.wireframe})
 
-    def draw(self, positions: NDArray[Any], instruments: Sequence[Solid] = ()) -> Picture:
-        """Draw the sheet, with positions of the mass points [m], shape (rows, cols, 3), and the instruments."""
-        return self._renderer.draw(Shot(positions, self.view, instruments), self.render)
+    def draw(
+        self, positions: NDArray[Any], instruments: Sequence[Solid] = (), size: tuple[int, int] | None = None
+    ) -> Picture:
+        """Draw the sheet, with positions of the mass points [m], shape (rows, cols, 3), and the instruments.
+
+        `size` is width and height of the picture [px], by default those of the scene.
+        """
+        view, render = self.view, self.render
+        if size is not None and size != render.size:
+            view, render = view.cropped((0, 0, *render.size), size), render.model_copy(update={"size": size})
+        return self._renderer.draw(Shot(positions, view, instruments), render)
 
     def project(self, point: NDArray[np.floating]) -> tuple[float, float] | None:
         """Project a point [m], shape (3,), to a pixel (x, y); None behind the camera."""

@@ -76,6 +76,11 @@ def test_invalid_arguments_of_view(
     assert sorted(path.name for path in small.iterdir()) == ["small.yaml", "speckle.png"]
 
 
+def test_film_without_a_scene(capsys: pytest.CaptureFixture[str], message: Messages) -> None:
+    assert main(["view", "--record", "a.gif", "--seconds", "1"]) == 2
+    message(capsys.readouterr().err)
+
+
 # Invalid scripts, and the locations of their faults.
 FAULTS = {
     "empty": ("", "1:1"),
@@ -193,8 +198,8 @@ class Clock:
         return self.now
 
 
-def simulated_frames(clock: Clock, stepping: float, drawing: float, seconds: float) -> tuple[int, str]:
-    """Simulate a machine with times [s] for a frame and a picture; return the number of frames, and the status."""
+def simulated_frames(clock: Clock, stepping: float, drawing: float, seconds: float) -> tuple[int, float]:
+    """Simulate a machine with times [s] for a frame and a picture; return the number of frames, and the speed."""
     pacing, frames = Pacing(50.0, clock), 0
     while clock.now < seconds:
         clock.now += pacing.delay_s()
@@ -202,24 +207,25 @@ def simulated_frames(clock: Clock, stepping: float, drawing: float, seconds: flo
             clock.now += stepping
             frames += 1
         clock.now += drawing
-    return frames, pacing.status()
+    return frames, pacing.speed()[1]
 
 
 @pytest.mark.parametrize(
-    ("stepping", "drawing", "frames"),
+    ("stepping", "drawing", "frames", "speed"),
     [
-        (0.002, 0.01, 500),
+        (0.002, 0.01, 500, 1.0),
         # Several frames per picture, in real time.
-        (0.002, 0.07, 500),
+        (0.002, 0.07, 500, 1.0),
         # A picture per frame, slower than real time.
-        (0.05, 0.01, 167),
+        (0.05, 0.01, 167, 0.33),
     ],
     ids=["fast", "slow pictures", "slow steps"],
 )
-def test_session_runs_in_real_time(stepping: float, drawing: float, frames: int, message: Messages) -> None:
-    count, status = simulated_frames(Clock(), stepping, drawing, 10.0)
+def test_session_runs_in_real_time(stepping: float, drawing: float, frames: int, speed: float) -> None:
+    count, measured = simulated_frames(Clock(), stepping, drawing, 10.0)
     assert count == pytest.approx(frames, rel=0.03)
-    message(status)
+    # A picture of 0.08 s more or less in the second over which the speed is measured.
+    assert measured == pytest.approx(speed, abs=0.08)
 
 
 def test_long_delays_are_skipped() -> None:

@@ -5,14 +5,18 @@ const element = id => document.getElementById(id);
 const canvas = element("picture");
 const picture = canvas.getContext("2d");
 
-// Both plots show the readings of these last seconds.
-const WINDOW_S = 8;
+// The plot over time shows these last seconds; the one over depth all readings, up to this number.
+const WINDOW_S = 8, MAX_READINGS = 3000;
 const MATERIAL_INTERVAL_MS = 80;
 const WHEEL_NOTCH_PX = 100, WHEEL_NOTCH_LINES = 3;
 const RETRY_MS = 1000;
 
 let socket = null, session = null, state = null, ended = false, mode = "press";
 let readings = [];
+
+// A reloaded page keeps its name, and so the tool.
+const pageName = sessionStorage.getItem("name") ?? crypto.getRandomValues(new Uint32Array(4)).join("-");
+sessionStorage.setItem("name", pageName);
 
 // ---- numbers
 
@@ -50,7 +54,7 @@ function steer(...message) {
 }
 
 function connect() {
-  const url = new URL("socket", location.href);
+  const url = new URL(`socket?name=${pageName}`, location.href);
   url.protocol = url.protocol.replace("http", "ws");
   socket = new WebSocket(url);
   socket.binaryType = "arraybuffer";
@@ -68,6 +72,7 @@ function connect() {
 
 function receive(message) {
   if (message.size) describe(message);
+  else if (message.scenes) { ended = true; location.reload(); }
   else if (message.ended) { ended = true; showNotice("the session has ended"); }
   else if (message.notice) showNotice(message.notice);
   else if (message.error) console.error(message.error);
@@ -78,6 +83,7 @@ async function receivePicture(data) {
   const header = JSON.parse(new TextDecoder().decode(new Uint8Array(data, 4, length)));
   if (data.byteLength > 4 + length) {
     const image = await createImageBitmap(new Blob([new Uint8Array(data, 4 + length)], {type: "image/jpeg"}));
+    [canvas.width, canvas.height] = [image.width, image.height];
     picture.drawImage(image, 0, 0);
     image.close();
   }
@@ -91,7 +97,7 @@ function describe(message) {
   session = message;
   readings = [];
   document.title = element("title").textContent = session.title;
-  [canvas.width, canvas.height] = session.size;
+  sendWidth();
   document.documentElement.style.setProperty("--ratio", session.size[0] / session.size[1]);
   document.querySelectorAll(".material").forEach(row => row.remove());
   session.material.forEach(entry => element("sliders").append(materialRow(entry)));
@@ -112,13 +118,14 @@ function update(next) {
     readings.push(reading);
   }
   if (state.time === 0) readings = [];
-  const first = readings.findIndex(([time]) => time > state.time - WINDOW_S);
-  readings.splice(0, Math.max(0, first - 1));
+  readings.splice(0, Math.max(0, readings.length - MAX_READINGS));
   const [, force, depth] = readings.at(-1) ?? [0, 0, 0];
   showNumber("force", ...withPrefix(Math.abs(force) < 1e-6 ? 0 : force, "N"));
   showNumber("depth", digits(1e3 * depth), "mm");
   showNumber("time", state.time.toFixed(1), "s");
-  element("pacing").textContent = state.pacing;
+  element("pacing").textContent = state.speed < 0.95 ? `too slow: ${state.speed.toFixed(2)} × real time` : `${state.rate} pictures/s`;
+  element("pacing").classList.toggle("slow", state.speed < 0.95);
+  showSaved();
   showNotice(state.notice);
   showRole();
   showControls();
@@ -130,11 +137,24 @@ function showNotice(text) {
   element("notice").classList.toggle("shown", Boolean(text));
 }
 
+function showSaved() {
+  const names = state.saved.join("/"), list = element("saved");
+  if (list.dataset.names === names) return;
+  list.dataset.names = names;
+  list.hidden = !names;
+  list.replaceChildren("Download: ", ...state.saved.map(name => Object.assign(document.createElement("a"), {
+    textContent: name, download: name, href: `saved/${encodeURIComponent(name)}`,
+  })));
+}
+
 function showRole() {
   const others = state?.watching ?? 0, role = element("role");
-  role.textContent = ended ? "ended" : !state ? "no connection" : !state.steers ? "watching; another page steers"
+  role.textContent = ended ? "ended" : !state ? "no connection" : state.asks ? "asking the page that steers" : state.was_refused && !state.steers ? "refused; the next time it cannot" : !state.steers ? "watching"
     : others ? `you steer, ${others} watching` : "you steer";
   role.className = ended || !state ? "lost" : state.steers ? "steers" : "";
+  element("take-over").hidden = !state || state.steers || state.asks;
+  element("scenes").hidden = !session?.has_scenes || !state?.steers;
+  element("question").hidden = !state?.is_asked;
   document.body.classList.toggle("watching", !state?.steers);
   for (const id of ["controls", "sliders", "view"]) element(id).disabled = !state?.steers;
 }
@@ -197,8 +217,8 @@ const pointers = new Map();
 let action = null, last = null;
 
 function pixel(event) {
-  // Whole numbers are pixel centres.
-  const box = canvas.getBoundingClientRect(), scale = canvas.width / box.width;
+  // Pixels of the scene's picture; whole numbers are their centres.
+  const box = canvas.getBoundingClientRect(), scale = session.size[0] / box.width;
   return [event.clientX - box.left, event.clientY - box.top].map(length => Math.round(100 * (scale * length - 0.5)) / 100);
 }
 
@@ -273,14 +293,14 @@ function keyName(event) {
 window.addEventListener("keydown", event => {
   const name = keyName(event), {target} = event;
   const taken = (target.tagName === "BUTTON" && name === "space") || (target.tagName === "INPUT" && event.key.startsWith("Arrow"));
-  if (!name || taken || event.ctrlKey || event.metaKey || event.altKey || element("help").open) return;
+  if (!name || taken || event.ctrlKey || event.metaKey || event.altKey || (element("help").open && name !== "h")) return;
   event.preventDefault();
   // Only keys of the strength repeat.
   if (!event.repeat || name === "up" || name === "down") press(name);
 });
 
 function press(name) {
-  if (name === "h") element("help").showModal();
+  if (name === "h") element("help").open ? element("help").close() : element("help").showModal();
   else if (name === "i") document.body.classList.toggle("bare");
   else steer("key", name);
 }
@@ -295,6 +315,23 @@ for (const button of document.querySelectorAll("button[data-mode]")) {
     document.querySelectorAll("button[data-mode]").forEach(each => each.setAttribute("aria-pressed", each === button));
   });
 }
+
+for (const [id, ...message] of [["take-over", "takeover"], ["give", "answer", true], ["refuse", "answer", false], ["scenes", "scenes"]]) {
+  element(id).addEventListener("click", () => send(...message));
+}
+
+element("full-screen").hidden = !document.fullscreenEnabled;
+element("full-screen").addEventListener("click", () => {
+  if (document.fullscreenElement) document.exitFullscreen();
+  else document.documentElement.requestFullscreen();
+});
+
+// The server draws the picture with the pixels of this screen if it is fast enough.
+function sendWidth() {
+  if (session) send("width", Math.round(canvas.clientWidth * devicePixelRatio));
+}
+
+new ResizeObserver(sendWidth).observe(canvas);
 
 // ---- plots
 
