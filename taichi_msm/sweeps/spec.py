@@ -69,7 +69,8 @@ class SweepSettings(Section):
         [],
         "groups of keys of the scene by their dotted paths, each with a list of values; the keys of a group vary row "
         "by row, and each group is a grid",
-        "a list of mappings from keys to lists, such as [{tissue.young: [1.0e+4, 2.0e+4], tissue.thickness: [1.0e-3, 2.0e-3]}]",
+        "a list of mappings from keys to lists, such as "
+        "[{tissue.young: [1.0e+4, 2.0e+4], tissue.thickness: [1.0e-3, 2.0e-3]}]",
     )
     set: dict[str, Any] = key(
         {},
