@@ -72,7 +72,7 @@ function connect() {
 
 function receive(message) {
   if (message.size) describe(message);
-  else if (message.scenes) { ended = true; location.reload(); }
+  else if (message.scenes) { ended = true; setTimeout(() => location.reload(), RETRY_MS); }
   else if (message.ended) { ended = true; showNotice("the session has ended"); }
   else if (message.notice) showNotice(message.notice);
   else if (message.error) console.error(message.error);
