@@ -35,7 +35,7 @@ def example(name: str | None, directory: str) -> None:
         with writing(target, "DIR"), replacing(target) as file:
             file.write(path.read_bytes())
         click.echo(printable(str(target)))
-    command = "sweep" if "vary" in content(scenes[name]) else "run"
+    command = "sweep" if "vary" in _content(scenes[name]) else "run"
     click.echo(printable(f"next: taichi-msm {command} {shlex.quote(str(targets[scenes[name]]))}"))
 
 
@@ -52,8 +52,7 @@ def shipped_scenes() -> dict[str, Path]:
     }
 
 
-def content(path: Path) -> Any:
-    """Read the content of a scene file."""
+def _content(path: Path) -> Any:
     from taichi_msm.load.yaml_reader import read_yaml
 
     return read_yaml(path.read_text(encoding="utf-8")).data
@@ -69,7 +68,7 @@ def _files(path: Path) -> Iterator[Path]:
     """Yield a shipped file and, recursively, the files that it names, also by patterns."""
     yield path
     if path.suffix == ".yaml":
-        for text in _texts(content(path)):
+        for text in _texts(_content(path)):
             for name in sorted(glob(text, root_dir=path.parent)):  # noqa: PTH207  # Path.glob refuses ".."
                 yield from _files((path.parent / name).resolve())
 

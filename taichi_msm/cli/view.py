@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from taichi_msm.cli import common, options
-from taichi_msm.cli.example import content, shipped_scenes, summary
+from taichi_msm.cli.example import scenes_folder, shipped_scenes, summary
 from taichi_msm.errors import FilesError, NotInstalledError, SceneError, printable, truncate
 from taichi_msm.system.process import Interruption, write_stderr
 
@@ -79,7 +79,10 @@ def view(
             expected = "give only the scheme, host and port of the page, as https://hub.example.org"
             raise click.BadParameter(f"{truncate(origin)} is not an origin; {expected}", param_hint="--origin")
     interruption = Interruption()
-    open_session = partial(_open, out=out, image=image, overrides=overrides, interruption=interruption, **settings)
+
+    def open_session(scene: str) -> AbstractContextManager[Session]:
+        return _open(scene, out, image, overrides, interruption, settings)
+
     with common.report_interruption(interruption, False, lambda: "; no film was written" if seconds else ""):
         if scene is not None and film is not None and seconds is not None:
             loaded_script = load_script(script, load_scene(scene, overrides, image).render.size) if script else None
@@ -107,7 +110,7 @@ def _open(
     image: str | None,
     overrides: tuple[str, ...],
     interruption: Interruption,
-    **settings: Any,
+    settings: dict[str, Any],
 ) -> Iterator[Session]:
     """Open a session of a scene file; print the paths of its files at the end."""
     from taichi_msm.load.scene_file import load_scene
@@ -158,7 +161,7 @@ def _serve_scenes(
 
     interruption.listen()
     scenes, fault, wants_scenes = shipped_scenes(), "", True
-    summaries = {name: summary(path) for name, path in scenes.items() if "vary" not in content(path)}
+    summaries = {name: summary(path) for name, path in scenes.items() if path.parent == scenes_folder()}
     while wants_scenes:
         chosen = choose(address, summaries, interruption.raise_if_requested, lambda line: write_stderr([line]), fault)
         name = asyncio.run(chosen)

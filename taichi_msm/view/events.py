@@ -154,7 +154,7 @@ def parse_message(message: str | bytes) -> Event | Request:
     """Parse a message of a page; the ValueError of an invalid one has its name and the reason."""
     values: Any = json.loads(message)
     if not (isinstance(values, list) and values and isinstance(values[0], str) and values[0] in _EVENTS):
-        raise ValueError(f"not a list of an event and its values; the events are {', '.join(_EVENTS)}")
+        raise ValueError(f"not a list of a message's name and its values; the names are {', '.join(_EVENTS)}")
     if any(isinstance(value, (int, float)) and not abs(value) <= MAX_VALUE for value in values):
         raise ValueError(f"{values[0]}: a value is not from {-MAX_VALUE:g} to {MAX_VALUE:g}")
     try:

@@ -169,7 +169,7 @@ class Server:
         """Release the tool, and let a page steer."""
         self._events.append(events.Release())
         self.pages = [page, *(each for each in self.pages if each is not page)]
-        self._asking, self._return_end = None, 0.0
+        self._asking, self._return_end, page.was_refused = None, 0.0, False
 
     def receive(self, page: _Connection, message: str | bytes) -> None:
         """Handle a message of a page, or queue its event if it steers; reply to an invalid message with its error."""

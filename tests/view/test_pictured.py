@@ -60,7 +60,7 @@ def test_session(kind: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, dev
         session.handle(Turn(20, 10))
         session.advance()
         assert np.abs(session.bare_picture().astype(int) - speckle(HEIGHT, WIDTH)).mean() > 10
-        path = session._captures.save_scene(session.recorded_scene())
+        path = session.captures.save_scene(session.recorded_scene())
         positions = session.positions().copy()
     recorded = load_scene(str(path))
     np.testing.assert_array_equal(rest_of(recorded.sheet).position, at_rest)

@@ -17,6 +17,7 @@ from pathlib import Path
 from time import monotonic
 from typing import Any, ClassVar, get_args
 from urllib.parse import urlsplit
+from zipfile import ZipFile
 
 import numpy as np
 import pytest
@@ -31,9 +32,11 @@ from taichi_msm.runs.media import Picture
 from taichi_msm.system.runtime import Device
 from taichi_msm.view import server as server_module
 from taichi_msm.view import web as web_module
+from taichi_msm.view.chooser import choose
 from taichi_msm.view.events import KEYS, MAX_BYTES, Event, parse_message
 from taichi_msm.view.material import MATERIAL
 from taichi_msm.view.recording import Captures
+from taichi_msm.view.resolution import LEVELS
 from taichi_msm.view.server import (
     MAX_INVALID_MESSAGES,
     MAX_PAGES,
@@ -111,8 +114,8 @@ class Client:
         raise TimeoutError
 
 
-async def connect(server: Server, **headers: str) -> Client:
-    url = server.url.replace("http", "ws") + "socket"
+async def connect(server: Server, name: str = "", **headers: str) -> Client:
+    url = server.url.replace("http", "ws") + "socket" + (f"?name={name}" if name else "")
     return Client(await websocket_connect(HTTPRequest(url, headers=headers)))
 
 
@@ -221,6 +224,145 @@ async def test_one_page_steers(session: Session) -> None:
         frame = session.frame
         await asyncio.sleep(0.3)
         assert session.frame == frame, "without a page the session waits"
+
+
+@scenario
+async def test_reloaded_page_steers_again(session: Session, monkeypatch: pytest.MonkeyPatch) -> None:
+    async with served(session) as server:
+        first, watching = await connect(server, "first"), await connect(server, "second")
+        await watching.until(lambda state: not state["steers"])
+        first.connection.close()
+        await watching.until(lambda state: state["steers"])
+        reloaded = await connect(server, "first")
+        await reloaded.until(lambda state: state["steers"])
+        await watching.until(lambda state: not state["steers"])
+        monkeypatch.setattr(server_module, "RETURN_S", -1.0)
+        reloaded.connection.close()
+        await watching.until(lambda state: state["steers"])
+        late = await connect(server, "first")
+        await late.until(lambda state: not state["steers"])
+
+
+@scenario
+async def test_watching_page_takes_over_and_can_be_refused_once(
+    session: Session, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    async with served(session) as server:
+        first, second = await connect(server), await connect(server)
+        await first.send("press", 60, 50)
+        await first.until(lambda state: state["handled"] == 1)
+        await second.send("answer", True)
+        await second.send("takeover")
+        await second.until(lambda state: state["asks"] and not state["steers"])
+        await first.until(lambda state: state["is_asked"])
+        await first.send("answer", False)
+        await second.until(lambda state: state["was_refused"])
+        await second.send("takeover")
+        await second.until(lambda state: state["steers"])
+        await first.until(lambda state: not state["steers"])
+        assert not session.tool.engaged, "the tool is released"
+        # Without an answer, the page that asks steers.
+        monkeypatch.setattr(server_module, "ANSWER_S", 0.0)
+        await first.send("takeover")
+        await first.until(lambda state: state["steers"])
+        monkeypatch.undo()
+        await second.send("takeover")
+        state = await second.until(lambda state: state["asks"])
+        assert not state["steers"], "a page that has steered can be refused again"
+
+
+@scenario
+async def test_new_page_gets_the_readings_of_every_frame(session: Session) -> None:
+    async with served(session) as server:
+        first = await connect(server)
+        await first.until(lambda state: state["time"] > 0.5)
+        watching = await connect(server)
+        readings: list[list[float]] = []
+        while len(readings) < 40:
+            state = await watching.until(lambda state: True)
+            readings += state["readings"]
+        times = np.array([reading[0] for reading in readings])
+        assert times * session.frame_rate == pytest.approx(1 + np.arange(len(times)), abs=1e-3)
+
+
+@scenario
+async def test_saved_files_are_downloaded(session: Session) -> None:
+    async with served(session) as server:
+        client = await connect(server)
+        for key in "pw":
+            await client.send("key", key)
+        names = (await client.until(lambda state: len(state["saved"]) == 2))["saved"]
+        assert names == ["picture-1.png", "session-1.zip"]
+        picture, packed = [(await AsyncHTTPClient().fetch(f"{server.url}saved/{name}")).body for name in names]
+        assert picture == Path("captures/picture-1.png").read_bytes()
+        with ZipFile(BytesIO(packed)) as archive:
+            assert sorted(archive.namelist()) == ["session-1.yaml", "speckle.png"]
+            assert archive.read("session-1.yaml") == Path("captures/session-1.yaml").read_bytes()
+        for name in ("session-1.yaml", "../small.yaml", "..%2Fsmall.yaml", "%2Fetc%2Fpasswd"):
+            assert await status(f"{server.url}saved/{name}") == 404, name
+        assert await status(f"{server.url}saved/picture-1.png", Origin="https://evil.example.org") == 403
+        Path("captures/picture-1.png").unlink()
+        assert await status(f"{server.url}saved/picture-1.png") == 404
+
+
+@scenario
+async def test_picture_has_the_pixels_of_the_steering_page(session: Session) -> None:
+    async with served(session) as server:
+        client, watching = await connect(server), await connect(server)
+        await watching.send("width", 1000)
+        await client.send("width", 240)
+        server._resolution.measure = lambda seconds, load: None  # type: ignore[method-assign]
+        server._resolution._level = LEVELS
+        sizes = set()
+        for _ in range(20):
+            await client.until(lambda state: True)
+            with Image.open(BytesIO(client.jpeg)) as picture:
+                sizes.add(picture.size)
+        assert (240, 200) in sizes
+        assert sizes <= {(120, 100), (240, 200)}
+        await client.send("press", 60, 50)
+        await client.until(lambda state: state["handled"] == 1)
+        assert np.array(session.tool.position) == pytest.approx([0.5, 0.5], abs=0.03)
+
+
+def test_pages_choose_a_scene_and_return(small: Path) -> None:
+    async def steps() -> None:
+        with Address(0) as address:
+            choosing = asyncio.create_task(
+                choose(address, {"press": "A <b>tool</b>."}, lambda: None, lambda line: None, "cannot & must")
+            )
+            while True:
+                with suppress(HTTPClientError, ConnectionError):
+                    page = (await AsyncHTTPClient().fetch(address.url)).body.decode()
+                    break
+            assert "A &lt;b&gt;tool" in page
+            assert "cannot &amp; must" in page
+            assert await status(address.url[:-2] + "/?scene=press") == 403
+            assert await status(address.url + "?scene=none") == 200
+            assert await status(address.url + "style.css") == 200
+            assert not choosing.done()
+            assert await status(address.url + "?scene=press") == 200
+            assert await choosing == "press"
+            # The next server at the same address.
+            waiting = asyncio.create_task(status(address.url + "style.css"))
+            again = asyncio.create_task(choose(address, {"press": ""}, lambda: None, lambda line: None))
+            assert await waiting == 200
+            again.cancel()
+            await asyncio.wait([again])
+
+    asyncio.run(steps())
+
+
+@scenario
+async def test_page_leaves_for_the_scenes(session: Session) -> None:
+    for has_scenes in (False, True):
+        with Address(0) as address:
+            server = Server(session, address, "small.yaml", has_scenes=has_scenes)
+            running = asyncio.create_task(server.run(lambda: None))
+            client = await connect(server)
+            await client.send("scenes")
+            await client.send("key", "q")
+            assert await asyncio.wait_for(running, WAIT_S) == has_scenes
 
 
 def shows(notice: str, state: dict[str, Any]) -> bool:
@@ -578,6 +720,15 @@ async def test_page_in_chromium(session: Session, tmp_path: Path) -> None:
         await tab.until("state.mesh && element('mesh').ariaPressed === 'true'")
         await tab.key(" ")
         await tab.until("state.paused")
+        # `h` closes the list that it has opened.
+        for is_open in ("true", "false"):
+            await tab.key("h")
+            await tab.until(f"element('help').open === {is_open}")
+        await tab.key("p")
+        await tab.until("document.querySelector('#saved a')?.textContent === 'picture-1.png'")
+        # A reloaded page steers at once.
+        await tab.call("Page.reload")
+        await tab.until("typeof state !== 'undefined' && state?.steers && session !== null")
         # The layout of a telephone, and touch.
         await tab.resize(400, 800, touch=True)
         handled = await tab.value("state.handled")

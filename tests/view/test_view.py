@@ -76,6 +76,11 @@ def test_invalid_arguments_of_view(
     assert sorted(path.name for path in small.iterdir()) == ["small.yaml", "speckle.png"]
 
 
+def test_film_without_a_scene(capsys: pytest.CaptureFixture[str], message: Messages) -> None:
+    assert main(["view", "--record", "a.gif", "--seconds", "1"]) == 2
+    message(capsys.readouterr().err)
+
+
 # Invalid scripts, and the locations of their faults.
 FAULTS = {
     "empty": ("", "1:1"),

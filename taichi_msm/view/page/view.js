@@ -72,7 +72,7 @@ function connect() {
 
 function receive(message) {
   if (message.size) describe(message);
-  else if (message.scenes) { ended = true; location.reload(); }
+  else if (message.scenes) { ended = true; setTimeout(() => location.reload(), RETRY_MS); }
   else if (message.ended) { ended = true; showNotice("the session has ended"); }
   else if (message.notice) showNotice(message.notice);
   else if (message.error) console.error(message.error);
@@ -97,7 +97,6 @@ function describe(message) {
   session = message;
   readings = [];
   document.title = element("title").textContent = session.title;
-  element("scenes").hidden = !session.has_scenes;
   sendWidth();
   document.documentElement.style.setProperty("--ratio", session.size[0] / session.size[1]);
   document.querySelectorAll(".material").forEach(row => row.remove());
@@ -154,6 +153,7 @@ function showRole() {
     : others ? `you steer, ${others} watching` : "you steer";
   role.className = ended || !state ? "lost" : state.steers ? "steers" : "";
   element("take-over").hidden = !state || state.steers || state.asks;
+  element("scenes").hidden = !session?.has_scenes || !state?.steers;
   element("question").hidden = !state?.is_asked;
   document.body.classList.toggle("watching", !state?.steers);
   for (const id of ["controls", "sliders", "view"]) element(id).disabled = !state?.steers;
