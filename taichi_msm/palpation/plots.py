@@ -75,14 +75,14 @@ def _draw_map(figure: Figure, result: Palpation, plane: Plane) -> None:
     norm = LogNorm(centre / ratio, centre * ratio)
     figure.suptitle(f"Stiffness of {printable(Path(result.name).name)}", x=0.01, ha="left", parse_math=False)
     left, right = figure.subplots(1, 2, sharey=True)
-    grey = f"; grey: over {MM * length:.2g} mm from every press" if is_unknown.any() else ""
+    grey = f"\ngrey: over {MM * length:.2g} mm from every press" if is_unknown.any() else ""
     _draw_panel(left, plane, stiffness, norm, "viridis", "stiffness [N/cm³]: dark soft, bright stiff")
-    left.set_title("Stiffness of the map; dots: of each press")
+    left.set_title("Map; dots: each press")
     left.scatter(
         *MM * plane.places[:, :2].T, c=measured, cmap="viridis", norm=norm, s=16, edgecolors="white", linewidths=0.7
     )
-    _draw_panel(right, plane, width, Normalize(0, float(np.nanmax(width))), "cividis", "95 % interval, ± [%]")
-    right.set_title(f"Uncertainty{grey}")
+    _draw_panel(right, plane, width, Normalize(0, float(np.nanmax(width))), "cividis", f"95 % interval, ± [%]{grey}")
+    right.set_title("Uncertainty")
     right.plot(*MM * plane.places[:, :2].T, ".", color="white", markersize=2)
     left.set_ylabel("across [mm]")
     for n, name, marker in ((measured.argmax(), "stiffest", "^"), (measured.argmin(), "softest", "v")):
