@@ -3,6 +3,11 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.image import AxesImage
 
 # The palette of Okabe and Ito, safe for colour-blind readers.
 BLUE, VERMILION, GREEN, ORANGE, PURPLE, SKY = "#0072B2", "#D55E00", "#009E73", "#E69F00", "#CC79A7", "#56B4E9"
@@ -15,3 +20,19 @@ DPI = 200
 
 # Widths of figures [in].
 TWO_COLUMN_WIDTH, ONE_COLUMN_WIDTH = 9.0, 6.0
+
+
+def add_colour_bar(axes: Axes, image: AxesImage, label: str, location: str, shrink: float) -> None:
+    """Add a colour bar to axes, with few numbers in decimal notation."""
+    from matplotlib.colors import LogNorm
+    from matplotlib.figure import Figure
+    from matplotlib.ticker import LogLocator, MaxNLocator, NullFormatter, ScalarFormatter
+
+    assert isinstance(axes.figure, Figure)
+    bar = axes.figure.colorbar(image, ax=axes, label=label, location=location, shrink=shrink)
+    if isinstance(image.norm, LogNorm):
+        bar.locator, bar.formatter = LogLocator(subs=(1.0, 1.5, 2.0, 3.0, 5.0, 7.0)), ScalarFormatter()
+        bar.minorformatter = NullFormatter()
+    else:
+        bar.locator = MaxNLocator(5)
+    bar.update_ticks()

@@ -43,7 +43,7 @@ def example(name: str | None, directory: str) -> None:
         with writing(target, "DIR"), replacing(target) as file:
             file.write(content)
         click.echo(printable(str(target)))
-    command = "sweep" if "vary" in _content(scenes[name]) else "run"
+    command = "run" if "sheet" in _content(scenes[name]) else "sweep"
     click.echo(printable(f"next: taichi-msm {command} {shlex.quote(str(first))}"))
 
 

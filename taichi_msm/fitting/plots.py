@@ -16,7 +16,7 @@ from matplotlib.colors import LogNorm, Normalize
 from matplotlib.figure import Figure
 from matplotlib.layout_engine import ConstrainedLayoutEngine
 from matplotlib.patches import Rectangle
-from matplotlib.ticker import LogLocator, MaxNLocator, NullFormatter, ScalarFormatter
+from matplotlib.ticker import MaxNLocator
 from numpy.typing import NDArray
 
 from taichi_msm.arithmetic import Array
@@ -25,7 +25,7 @@ from taichi_msm.fitting.machine_fit import FittedTest
 from taichi_msm.fitting.panels import Panel
 from taichi_msm.fitting.result import FitResult, FittedMap
 from taichi_msm.fitting.tikhonov import SmoothnessWeight
-from taichi_msm.plot_style import BLUE, DPI, GREY, ORANGE, SILVER, STYLE, TWO_COLUMN_WIDTH, VERMILION
+from taichi_msm.plot_style import BLUE, DPI, GREY, ORANGE, SILVER, STYLE, TWO_COLUMN_WIDTH, VERMILION, add_colour_bar
 from taichi_msm.scene.sheet import Sheet
 
 COLUMN_COUNT = 3
@@ -141,15 +141,7 @@ def _plot_cells(
     across = "across; hatched: unknown" if unknown.any() else "across"
     axes.set(title=title, xlabel=across, ylabel="down", aspect=height / width)
     axes.grid(visible=False)
-    assert isinstance(axes.figure, Figure)
-    bar = axes.figure.colorbar(image, ax=axes, label=label, shrink=0.8)
-    if isinstance(norm, LogNorm):
-        bar.ax.yaxis.set_major_locator(LogLocator(subs=(1.0, 1.5, 2.0, 3.0, 5.0, 7.0)))
-        bar.ax.yaxis.set_major_formatter(ScalarFormatter())
-        bar.ax.yaxis.set_minor_formatter(NullFormatter())
-    else:
-        bar.locator = MaxNLocator(5)
-        bar.update_ticks()
+    add_colour_bar(axes, image, label, "right", 0.8)
 
 
 def _plot_weight(axes: Axes, choice: SmoothnessWeight) -> None:

@@ -5,7 +5,6 @@ Machine tests after the first one have scenes of their own, scene-1.yaml and so 
 
 from __future__ import annotations
 
-import json
 import shutil
 from pathlib import Path
 
@@ -16,7 +15,7 @@ from PIL import Image
 
 from taichi_msm.errors import printable
 from taichi_msm.fitting.result import FitResult, FittedMap, sixteen_bits
-from taichi_msm.runs.directory import Publication, PublicationSpec, create_file, list_files, write_new_file
+from taichi_msm.runs.directory import Publication, PublicationSpec, create_file, write_new_file
 from taichi_msm.scene.scene import Scene
 from taichi_msm.system.compiler import versions
 
@@ -52,10 +51,7 @@ def write_report(result: FitResult, published: Publication) -> None:
     else:
         with create_file(folder / PLOT) as file:
             plot(result, file)
-    written = sorted(list_files(folder, PATTERNS, strict=True))
-    record = {**result.as_json(), "versions": versions(), "files": written}
-    write_new_file(folder / RECORD, (json.dumps(record, indent=1, ensure_ascii=False, allow_nan=False) + "\n").encode())
-    published.publish([*written, RECORD])
+    published.publish_record({**result.as_json(), "versions": versions()})
 
 
 def _write_png(grey: NDArray[np.uint16], path: Path) -> None:

@@ -171,7 +171,7 @@ def _fill_times(grid: Grid, above: range, rows: list[int]) -> None:
 
 
 def _titles_above(grid: Grid, first: int, last: int) -> int | None:
-    """Return the last row of texts above the numbers from a row on, with as many cells, and other than units."""
+    """Return the row of titles above the numbers: the nearest one of texts, no units, with a cell per column."""
     width = sum(map(bool, grid.rows[first]))
     # The comments of LabVIEW are mostly empty.
     for n in range(first - 1, max(last, first - 1 - MAX_TITLE_ROWS), -1):

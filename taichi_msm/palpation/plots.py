@@ -12,14 +12,13 @@ from matplotlib.axes import Axes
 from matplotlib.colors import LogNorm, Normalize
 from matplotlib.figure import Figure
 from matplotlib.layout_engine import ConstrainedLayoutEngine
-from matplotlib.ticker import LogLocator, MaxNLocator, NullFormatter, ScalarFormatter
 from scipy.spatial import cKDTree
 
 from taichi_msm.arithmetic import Array
 from taichi_msm.errors import printable
 from taichi_msm.palpation.plane import Plane, find_plane
 from taichi_msm.palpation.result import Palpation
-from taichi_msm.plot_style import BLUE, DPI, INK, SKY, STYLE, TWO_COLUMN_WIDTH, VERMILION
+from taichi_msm.plot_style import BLUE, DPI, INK, SKY, STYLE, TWO_COLUMN_WIDTH, VERMILION, add_colour_bar
 
 # Pixels along the longer side of a map.
 PIXELS = 120
@@ -100,15 +99,7 @@ def _draw_panel(axes: Axes, plane: Plane, values: Array, norm: Normalize, colour
     image = axes.imshow(values, colours, norm=norm, extent=extent, interpolation="bilinear")
     axes.set(xlabel="along the longest side [mm]", aspect="equal")
     axes.grid(visible=False)
-    assert isinstance(axes.figure, Figure)
-    bar = axes.figure.colorbar(image, ax=axes, label=label, location="bottom", shrink=0.9)
-    if isinstance(norm, LogNorm):
-        bar.ax.xaxis.set_major_locator(LogLocator(subs=(1.0, 1.5, 2.0, 3.0, 5.0, 7.0)))
-        bar.ax.xaxis.set_major_formatter(ScalarFormatter())
-        bar.ax.xaxis.set_minor_formatter(NullFormatter())
-    else:
-        bar.locator = MaxNLocator(5)
-        bar.update_ticks()
+    add_colour_bar(axes, image, label, "bottom", 0.9)
 
 
 def _draw_curves(figure: Figure, result: Palpation) -> None:

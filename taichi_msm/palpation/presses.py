@@ -15,6 +15,9 @@ from taichi_msm.arithmetic import Array
 from taichi_msm.errors import SceneError
 from taichi_msm.palpation.table import Table
 
+# Option that chooses the labels of the presses.
+PLACE_OPTION = '--columns "place=NAME"'
+
 # Rows of a press, and presses of a table.
 MIN_ROWS, MIN_PRESSES, MAX_PRESSES = 4, 10, 5000
 
@@ -92,7 +95,7 @@ def choose_presses(table: Table) -> tuple[Presses, list[LeftOut]]:
     names, position, index = table.places, table.position, table.index
     if len(names) > MAX_PRESSES:
         fault = f"{len(names):,} presses, more than {MAX_PRESSES:,}"
-        raise SceneError([f"{table.name}: {fault}; split the table, or choose their labels by {table.place_option}"])
+        raise SceneError([f"{table.name}: {fault}; split the table, or choose their labels by {PLACE_OPTION}"])
     counts = np.bincount(index, minlength=len(names))
     starts = np.concatenate([[0], np.cumsum(counts)])
     presses = [slice(start, end) for start, end in pairwise(starts)]
@@ -105,7 +108,7 @@ def choose_presses(table: Table) -> tuple[Presses, list[LeftOut]]:
     if len(kept) < MIN_PRESSES:
         fault = f"{len(kept)} presses of {len(names)} can be fitted, fewer than {MIN_PRESSES}"
         example = f"; place {left_out[0].place}: {left_out[0].reason}" if left_out else ""
-        remedy = f"add presses, or choose the column of their labels by {table.place_option}"
+        remedy = f"add presses, or choose the column of their labels by {PLACE_OPTION}"
         raise SceneError([f"{table.name}: {fault}{example}; {remedy}"])
     everything = Presses(names, position, index, table.depth, table.force)
     return everything.subset(np.array(kept)), left_out
@@ -128,7 +131,7 @@ def _reason(depth: Array, force: Array, noise: float) -> str:
 def _noise(table: Table, presses: Sequence[slice]) -> float:
     """Return the standard deviation of the forces [N] about cubics in depth, at least a digit of the file.
 
-    Cubics have as many coefficients as a press of four rows, of which these take a parabola.
+    A cubic fits four rows exactly, so a press of four rows gets a parabola.
     """
     residuals = [np.zeros(1)]
     for press in presses:

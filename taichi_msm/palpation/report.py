@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import csv
 import io
-import json
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
@@ -14,7 +13,7 @@ import numpy as np
 from taichi_msm.palpation.predict import NORMAL_95
 from taichi_msm.palpation.result import Palpation
 from taichi_msm.palpation.scene import SCENE, STIFFNESS, TISSUE, write_scene
-from taichi_msm.runs.directory import Publication, PublicationSpec, create_file, list_files, write_new_file
+from taichi_msm.runs.directory import Publication, PublicationSpec, create_file, write_new_file
 from taichi_msm.system.compiler import versions
 
 RECORD, PLACES, PREDICTED, MAP, CURVES = "fit.json", "places.csv", "predicted.csv", "map.png", "curves.png"
@@ -58,10 +57,7 @@ def write_report(result: Palpation, published: Publication) -> None:
         for name, plot in ((MAP, plot_map), (CURVES, plot_curves)):
             with create_file(folder / name) as file:
                 plot(result, file)
-    written = sorted(list_files(folder, PATTERNS, strict=True))
-    record = {**result.as_json(), "versions": versions(), "files": written}
-    write_new_file(folder / RECORD, (json.dumps(record, indent=1, ensure_ascii=False, allow_nan=False) + "\n").encode())
-    published.publish([*written, RECORD])
+    published.publish_record({**result.as_json(), "versions": versions()})
 
 
 def _write_csv(path: Path, header: Sequence[str], labels: Iterable[str], columns: Sequence[Any]) -> None:

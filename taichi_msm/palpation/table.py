@@ -61,11 +61,6 @@ class Table:
     digit: float  # resolution of the forces: their last digit in the file [N]
     notes: tuple[str, ...]
 
-    @property
-    def place_option(self) -> str:
-        """Option that chooses the labels of the presses."""
-        return '--columns "place=NAME"'
-
 
 @dataclass(frozen=True)
 class _Column:

@@ -114,6 +114,13 @@ class Publication(AbstractContextManager["Publication"]):
         self.new_folder.replace(self.staging_folder / READY_FOLDER)
         self._complete()
 
+    def publish_record(self, record: Mapping[str, Any]) -> None:
+        """Write a record with the names of all new files, and publish them."""
+        names = sorted(list_files(self.new_folder, self._spec.patterns, strict=True))
+        text = json.dumps({**record, "files": names}, indent=1, ensure_ascii=False, allow_nan=False) + "\n"
+        write_new_file(self.new_folder / self._spec.record, text.encode())
+        self.publish([*names, self._spec.record])
+
     def __exit__(self, *_: object) -> None:
         # Errors are ignored: the next publication repeats the cleanup, and an exception of the block has precedence.
         with suppress(OSError, FilesError):

@@ -388,7 +388,7 @@ class Camera(Section):
         Args:
             size: width and height of the pictures [px].
             is_image: whether they are those of the scene's image, not render.size.
-            reference: camera that `beside` names, with its files, if any.
+            reference: camera of the key `beside`, with its files.
         """
         if self.calibration is None:
             given = self.intrinsics

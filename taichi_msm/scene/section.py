@@ -199,20 +199,20 @@ def _number_hint(text: str, expected: str) -> str:
         return ""
     if unit is None:
         reason = "with a point" if "," in text else "without quotes"
-        return f"; write {digits}, {reason}"
+        return f"; write {_shortest(value)}, {reason}"
     name, factor = _UNITS.get(unit, ("", 1.0))
     long_names = expected.replace("in m,", "in metres,").replace("in s,", "in seconds,")
     if not name or f"in {name}," not in f"{long_names},":
-        return "; write the number alone, in SI units, such as 3.0e4 for 30 kPa"
+        return "; write the number alone, in SI units, such as 3.0e+4 for 30 kPa"
     return f"; write {_shortest(value * factor)}, the number in {name}"
 
 
 def _shortest(value: float) -> str:
-    """Format a number as in a scene file, such as 0.003 or 3.0e4."""
+    """Format a number as in a scene file, such as 0.003 or 3.0e+4."""
     if value == 0 or 1e-3 <= abs(value) < 1e4:
         return f"{value:.10g}"
     mantissa, exponent = f"{value:.9e}".split("e")
-    return f"{float(mantissa)}e{int(exponent)}"
+    return f"{float(mantissa)}e{int(exponent):+}"
 
 
 def _message(fault: _Fault, data: Any) -> str:

@@ -514,10 +514,10 @@ output: []
 @pytest.mark.parametrize(
     ("key", "text", "number"),
     [
-        ("young", "30 kPa", "write 3.0e4, the number in Pa"),
-        ("young", "0.03MPa", "write 3.0e4, the number in Pa"),
-        ("young", "3,0e4", "write 3.0e4, with a point"),
-        ("young", '"3.0e4"', "write 3.0e4, without quotes"),
+        ("young", "30 kPa", "write 3.0e+4, the number in Pa"),
+        ("young", "0.03MPa", "write 3.0e+4, the number in Pa"),
+        ("young", "3,0e4", "write 3.0e+4, with a point"),
+        ("young", '"3.0e4"', "write 3.0e+4, without quotes"),
         ("thickness", "3 mm", "write 0.003, the number in metres"),
         ("thickness", "0,003", "write 0.003, with a point"),
         ("density", "1,050", "write 1050 or 1.050,"),
